@@ -1,0 +1,253 @@
+"""The policy's configuration: π0.5's, plus geometry. LeRobot finds it as `--policy.type=pi05_geometry`."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from .geometry.camera import CameraCalibration
+from .geometry.depth import METRES_PER_UNIT
+from .model.config import GeometrySegmentConfig, NetworkConfig
+from .model.precision import DTYPES
+from .model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
+
+CALIBRATION_PREFIX = "observation.calibration."
+DEPTH_SUFFIX = "_depth"
+
+_CHOICES = {
+    "paligemma_variant": tuple(PALIGEMMA_VARIANTS),
+    "action_expert_variant": tuple(EXPERT_VARIANTS),
+    "dtype": tuple(DTYPES),
+    "param_dtype": tuple(DTYPES),
+    "depth_unit": tuple(METRES_PER_UNIT),
+    "geometry_source": ("none", "rgbd", "random"),
+    "geometry_frame": ("base", "camera"),
+    "geometry_time": ("clean", "denoise"),
+    "geometry_positions": ("sequential", "parallel"),
+    "geometry_placement": ("segment", "prefix"),
+    "geometry_expert": ("shared", "own"),
+}
+
+
+@PreTrainedConfig.register_subclass("pi05_geometry")
+@dataclass
+class PI05GeometryConfig(PreTrainedConfig):
+    """Settings of `PI05GeometryPolicy`. Those without a comment are LeRobot's π0.5 settings, under its names."""
+
+    paligemma_variant: str = "gemma_2b"  # gemma_2b, small, tiny
+    action_expert_variant: str = "gemma_300m"  # gemma_300m, small, tiny
+    dtype: str = "float32"  # what matrix products compute in: float32 or bfloat16
+    param_dtype: str = "float32"  # what weights are stored in (model/precision.py says what stays float32)
+
+    n_obs_steps: int = 1
+    chunk_size: int = 50
+    n_action_steps: int = 50
+    max_state_dim: int = 32
+    max_action_dim: int = 32
+
+    # Geometry
+    geometry_source: str = "rgbd"  # none (plain π0.5), rgbd (depth cameras), random (control)
+    geometry_cameras: list[str] | None = None  # names in token order; None: every camera that has depth
+    geometry_grid: int = 8  # cells per side and camera
+    geometry_frame: str = "base"  # points in the robot's base frame, or in the camera's
+    geometry_time: str = "clean"  # flow time that conditions geometry: clean (cached) or denoise (recomputed)
+    geometry_positions: str = "sequential"  # rotary positions: sequential, or parallel (the suffix as in π0.5)
+    geometry_placement: str = "segment"  # a segment of its own, or in the VLM's prefix (comparison)
+    geometry_expert: str = "shared"  # the action expert's weights, or an own expert
+    geometry_gate_init: float = 0.0  # log-gate at the start: 0 open, -8 almost closed
+    geometry_dropout: float = 0.1  # probability that a training sample's whole geometry is masked
+    depth_unit: str = "mm"  # unit of the depth that arrives: mm (LeRobot's default) or m
+    max_depth: float = 10.0  # metres; farther counts as not measured
+    calibration_path: str | None = None  # JSON file; None: calibration.json in the dataset's meta folder
+    calibration: dict[str, CameraCalibration] = field(default_factory=dict)  # what was read from it
+    geometry_features: dict[str, PolicyFeature] = field(default_factory=dict)  # depth and poses, set by validate_features
+
+    # Tokenizer folder or hub id; None: PaliGemma's from the hub, or the built-in one for the small sizes.
+    tokenizer_path: str | None = None
+    tokenizer_max_length: int = 200
+
+    num_inference_steps: int = 10
+    time_sampling_beta_alpha: float = 1.5
+    time_sampling_beta_beta: float = 1.0
+    time_sampling_scale: float = 0.999
+    time_sampling_offset: float = 0.001
+    min_period: float = 4e-3
+    max_period: float = 4.0
+
+    use_relative_actions: bool = False
+    relative_exclude_joints: list[str] = field(default_factory=lambda: ["gripper"])
+    action_feature_names: list[str] | None = None
+
+    rtc_config: RTCConfig | None = None
+    image_resolution: tuple[int, int] = (224, 224)
+    empty_cameras: int = 0
+    absent_cameras: list[str] = field(default_factory=list)  # RGB keys that observations may lack
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.QUANTILES,
+            "ACTION": NormalizationMode.QUANTILES,
+        }
+    )
+
+    gradient_checkpointing: bool = False
+    freeze_vision_encoder: bool = False
+    train_expert_only: bool = False
+
+    optimizer_lr: float = 2.5e-5
+    optimizer_betas: tuple[float, float] = (0.9, 0.95)
+    optimizer_eps: float = 1e-8
+    optimizer_weight_decay: float = 0.01
+    optimizer_grad_clip_norm: float = 1.0
+    # The group of new parameters (adapter, gate, own expert): π0.5's rate is for fine-tuning, and a gate with 8 units
+    # to travel would need 320,000 steps of it. No weight decay, which would open a negative gate.
+    geometry_lr: float = 1e-3
+    geometry_eps: float = 1e-12  # a closed gate scales the adapter's gradients down
+
+    scheduler_warmup_steps: int = 1_000
+    scheduler_decay_steps: int = 30_000
+    scheduler_decay_lr: float = 2.5e-6
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"--policy.{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
+        self._check_numbers()
+        self.network()  # names variants that do not belong together
+
+    def _check_numbers(self) -> None:
+        if self.n_action_steps > self.chunk_size:
+            raise ValueError(f"n_action_steps ({self.n_action_steps}) must not exceed chunk_size ({self.chunk_size}).")
+        if self.geometry_grid < 1:
+            raise ValueError(f"geometry_grid must be at least 1, got {self.geometry_grid}.")
+        if not 0 <= self.geometry_dropout < 1:
+            raise ValueError(f"geometry_dropout must be in [0, 1), got {self.geometry_dropout}.")
+        if self.max_depth <= 0:
+            raise ValueError(f"max_depth must be above 0 m, got {self.max_depth}.")
+        if self.param_dtype == "bfloat16" and self.dtype == "float32":
+            raise ValueError("param_dtype=bfloat16 needs dtype=bfloat16: float32 products of bf16 weights gain nothing.")
+        if self.image_resolution[0] != self.image_resolution[1]:
+            raise ValueError(f"image_resolution must be square, got {tuple(self.image_resolution)}.")
+
+    def network(self) -> NetworkConfig:
+        """The part of this that the network has to know."""
+        geometry = None
+        if self.geometry_source != "none":
+            geometry = GeometrySegmentConfig(
+                time=self.geometry_time,  # type: ignore[arg-type]
+                positions=self.geometry_positions,  # type: ignore[arg-type]
+                placement=self.geometry_placement,  # type: ignore[arg-type]
+                expert=self.geometry_expert,  # type: ignore[arg-type]
+                gate_init=self.geometry_gate_init,
+            )
+        return NetworkConfig(
+            paligemma=PALIGEMMA_VARIANTS[self.paligemma_variant],
+            expert=EXPERT_VARIANTS[self.action_expert_variant],
+            image_size=self.image_resolution[0],
+            chunk_size=self.chunk_size,
+            max_action_dim=self.max_action_dim,
+            num_inference_steps=self.num_inference_steps,
+            min_period=self.min_period,
+            max_period=self.max_period,
+            dtype=DTYPES[self.dtype],
+            param_dtype=DTYPES[self.param_dtype],
+            geometry=geometry,
+        )
+
+    def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
+        """LeRobot calls this with a dataset's features: depth maps are known by their flag, whatever their name."""
+        for key, feature in features.items():
+            info = feature.get("info") or {}
+            depth = info.get("is_depth_map") or info.get("video.is_depth_map")
+            if depth and not key.endswith(DEPTH_SUFFIX):
+                raise ValueError(
+                    f"Dataset feature {key} is a depth map, but its name does not end in '{DEPTH_SUFFIX}', by which the "
+                    f"policy finds the depth of a camera; rename it to {OBS_IMAGES}.<camera>{DEPTH_SUFFIX}."
+                )
+
+    def validate_features(self) -> None:
+        """Complete the features, and move depth and calibration out of `input_features`.
+
+        LeRobot types a depth map as VISUAL and a camera matrix as STATE; left there, the one would reach SigLIP and the
+        other the normaliser.
+        """
+        inputs = dict(self.input_features or {})
+        for key in list(inputs):
+            if is_geometry_key(key):
+                self.geometry_features[key] = inputs.pop(key)
+        for i in range(self.empty_cameras):
+            inputs[f"{OBS_IMAGES}.empty_camera_{i}"] = PolicyFeature(
+                type=FeatureType.VISUAL, shape=(3, *self.image_resolution)
+            )
+        if OBS_STATE not in inputs:
+            inputs[OBS_STATE] = PolicyFeature(type=FeatureType.STATE, shape=(self.max_state_dim,))
+        self.input_features = inputs
+        self.output_features = dict(self.output_features or {})
+        if ACTION not in self.output_features:
+            self.output_features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(self.max_action_dim,))
+        action_dim = self.output_features[ACTION].shape[0]
+        if action_dim > self.max_action_dim:
+            raise ValueError(
+                f"The data has {action_dim} action dimensions, but max_action_dim is {self.max_action_dim}; raise it."
+            )
+
+    def depth_cameras(self) -> dict[str, tuple[int, int]]:
+        """Cameras with depth, in token order, and their (height, width)."""
+        prefix = f"{OBS_IMAGES}."
+        found = {
+            key.removeprefix(prefix).removesuffix(DEPTH_SUFFIX): (feature.shape[-2], feature.shape[-1])
+            for key, feature in self.geometry_features.items()
+            if key.startswith(prefix)
+        }
+        if self.geometry_cameras is None:
+            return dict(sorted(found.items()))
+        unknown = [camera for camera in self.geometry_cameras if camera not in found]
+        if unknown:
+            raise ValueError(
+                f"geometry_cameras names {', '.join(unknown)}, but the data has depth from "
+                f"{', '.join(sorted(found)) or 'no camera'} only (keys {prefix}<camera>{DEPTH_SUFFIX})."
+            )
+        return {camera: found[camera] for camera in self.geometry_cameras}
+
+    def may_be_absent(self, image_key: str) -> bool:
+        """Whether observations may lack this RGB camera."""
+        return image_key in self.absent_cameras or image_key.startswith(f"{OBS_IMAGES}.empty_camera_")
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            betas=self.optimizer_betas,
+            eps=self.optimizer_eps,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        return CosineDecayWithWarmupSchedulerConfig(
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.scheduler_decay_lr,
+            num_warmup_steps=self.scheduler_warmup_steps,
+            num_decay_steps=self.scheduler_decay_steps,
+        )
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+
+def is_geometry_key(key: str) -> bool:
+    """Whether an observation key belongs to the geometry segment: depth of a camera, or camera calibration."""
+    return key.startswith(CALIBRATION_PREFIX) or (key.startswith(f"{OBS_IMAGES}.") and key.endswith(DEPTH_SUFFIX))

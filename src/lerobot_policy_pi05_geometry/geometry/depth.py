@@ -1,0 +1,72 @@
+"""Depth of any layout, dtype and unit -> metres and valid pixels.
+
+LeRobot's robots give uint16 millimetres (H, W, 1), its datasets float millimetres (1, H, W) unless told metres, its
+environments float32 (B, H, W, 1). The unit cannot be guessed from the numbers, so it is declared (`depth_unit`), and a
+scene that is then implausible is an error.
+"""
+
+import torch
+from torch import Tensor
+
+METRES_PER_UNIT = {"m": 1.0, "mm": 1e-3}
+# Median distance of what a manipulator's camera sees; outside it the declared unit is wrong.
+PLAUSIBLE_MEDIAN = (0.02, 20.0)
+_DTYPES = (torch.uint16, torch.int16, torch.int32, torch.float16, torch.float32, torch.float64)
+
+
+def to_metres(depth: Tensor, key: str, unit: str, size: tuple[int, int], max_depth: float) -> tuple[Tensor, Tensor]:
+    """Normalise a depth batch.
+
+    depth: (B, 1, H, W), (B, H, W, 1) or (B, H, W). key: its name, for messages. unit: "mm" or "m". size: (H, W) that
+    the policy was configured with. max_depth: metres; what is farther counts as not measured.
+
+    Returns depth in metres, z along the optical axis, (B, 1, H, W) float32 with zeros where not valid, and validity
+    (B, 1, H, W) bool. NaN, inf, zero, negative and too far are not valid.
+
+    Raises ValueError for a dtype that no depth camera gives or a wrong size.
+    """
+    if depth.dtype not in _DTYPES:
+        raise ValueError(
+            f"{key} has dtype {depth.dtype}, but depth must be uint16 or float in the declared unit ({unit}); an "
+            "8-bit depth image has lost its distances, so record the camera's raw depth."
+        )
+    if depth.ndim == 3:
+        depth = depth[:, None]
+    elif depth.ndim == 4 and depth.shape[1] != 1 and depth.shape[-1] == 1:
+        depth = depth.permute(0, 3, 1, 2)
+    if depth.ndim != 4 or depth.shape[1] != 1 or tuple(depth.shape[-2:]) != tuple(size):
+        raise ValueError(
+            f"{key} has shape {tuple(depth.shape)}, but this policy expects depth of {size[0]} x {size[1]} pixels "
+            "(height x width, one channel); use the camera resolution it was trained with."
+        )
+    metres = depth.float() * METRES_PER_UNIT[unit]
+    valid = torch.isfinite(metres) & (metres > 0) & (metres <= max_depth)
+    return metres.masked_fill(~valid, 0.0), valid
+
+
+def check_measured(depth: Tensor, key: str) -> None:
+    """Raise ValueError if a frame is all NaN. depth: as given to `to_metres`, batch first."""
+    dead = depth.float().flatten(1).isnan().all(dim=1)
+    if dead.any():
+        raise ValueError(
+            f"{key} is all NaN in sample {int(dead.nonzero()[0])} of the batch, so the depth camera measured nothing; "
+            "drop the frame from the dataset, or store 0 for pixels without a measurement."
+        )
+
+
+def check_unit(depth: Tensor, key: str, unit: str) -> None:
+    """Raise ValueError if the distances show that the declared unit is wrong.
+
+    depth: as given to `to_metres`, before validity (a wrong unit would make everything "too far").
+    """
+    frames = depth.float().flatten(1)
+    seen = frames.isfinite() & (frames > 0)
+    metres = frames.masked_fill(~seen, float("nan")).nanmedian(dim=1).values * METRES_PER_UNIT[unit]
+    low, high = PLAUSIBLE_MEDIAN
+    wrong = (metres < low) | (metres > high)  # NaN (nothing measured) is neither
+    if wrong.any():
+        raise ValueError(
+            f"{key} has a median distance of {metres[wrong][0].item():.4g} m when read as '{unit}', outside {low}-{high} "
+            "m: the unit is probably wrong; set --policy.depth_unit to the unit of the data ('mm' or 'm'; LeRobot "
+            "datasets read as --dataset.depth_output_unit says, 'mm' by default)."
+        )

@@ -1,0 +1,83 @@
+"""Source and adapter together, and what to do when a depth camera fails.
+
+In training, a missing or dead camera is an error: the data is wrong. On a robot it is weather: once geometry has been
+seen, a camera that goes silent (its key is missing, or no pixel is valid) is masked, said once, and used again when it
+returns. A robot whose depth camera was never seen is misconfigured, which is an error again.
+"""
+
+import logging
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from .adapter import GeometryAdapter
+from .source import GeometryFeatures, GeometrySource
+
+logger = logging.getLogger(__name__)
+
+
+class GeometryEncoder(nn.Module):
+    """Observation batch -> tokens (B, V * G, W) float32 and padding mask (B, V * G)."""
+
+    def __init__(self, source: GeometrySource, width: int) -> None:
+        super().__init__()
+        self.source = source
+        self.adapter = GeometryAdapter(source.feature_dim, width, source.grid, len(source.cameras))
+        self._seen: set[str] = set()
+        self._failed: set[str] = set()
+        self._checked = False
+
+    def reset(self) -> None:
+        """Start of an episode: look into the values of the next observation again."""
+        self._checked = False
+
+    def forward(self, batch: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        if self.training:
+            missing = self.source.missing_cameras(batch)
+            if missing:
+                raise ValueError(self._missing_message(missing))
+            return self.adapter(self.source(batch, check=True))
+        return self.adapter(self._live(batch))
+
+    def _live(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
+        """Features at inference: a camera that fails is masked, once it has been seen."""
+        missing = self.source.missing_cameras(batch)
+        unknown = [camera for camera in missing if camera not in self._seen]
+        if unknown:
+            raise ValueError(self._missing_message(unknown))
+        if len(missing) == len(self.source.cameras):
+            self._report(set(missing))
+            return self._nothing(batch)
+        geometry = self.source(batch, check=not self._checked)
+        self._checked = True
+        # One look per call at which cameras are dead costs a synchronisation; on a robot B is 1 and V a handful.
+        alive = geometry.valid.any(dim=-1).any(dim=0).tolist()
+        dead = {camera for camera, ok in zip(self.source.cameras, alive, strict=True) if not ok}
+        self._seen |= set(self.source.cameras) - dead - set(missing)
+        self._report(dead)
+        return geometry
+
+    def _nothing(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
+        """Features of an observation without any geometry: all masked."""
+        like = next(v for k, v in batch.items() if k.startswith("observation.") and isinstance(v, Tensor))
+        shape = (like.shape[0], len(self.source.cameras), self.source.grid**2)
+        return GeometryFeatures(
+            torch.zeros(*shape, self.source.feature_dim, device=like.device),
+            torch.zeros(shape, dtype=torch.bool, device=like.device),
+        )
+
+    def _report(self, failed: set[str]) -> None:
+        """Say once that a camera failed, and once that it is back."""
+        for camera in sorted(failed - self._failed):
+            logger.warning("Depth camera '%s' gives no measurement: its geometry is masked until it returns.", camera)
+        for camera in sorted(self._failed - failed):
+            logger.info("Depth camera '%s' is back.", camera)
+        self._failed = failed
+
+    def _missing_message(self, cameras: list[str]) -> str:
+        keys = ", ".join(f"observation.images.{camera}_depth" for camera in cameras)
+        return (
+            f"The observation has no depth from camera(s) {', '.join(cameras)}: expected {keys}; connect the depth "
+            "camera, rename its key with --rename_map, or train with --policy.geometry_source=none."
+        )

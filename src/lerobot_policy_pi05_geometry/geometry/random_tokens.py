@@ -1,0 +1,28 @@
+"""The control that every claim about geometry needs: as many tokens, and nothing in them."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from .source import GeometryFeatures, GeometrySource
+
+_SEED = 20250101
+
+
+class RandomSource(GeometrySource):
+    """Fixed standard-normal features, the same for every observation and every run."""
+
+    def __init__(self, cameras: tuple[str, ...], grid: int, feature_dim: int = 55) -> None:
+        super().__init__()
+        self.cameras, self.grid, self.feature_dim = cameras, grid, feature_dim
+        generator = torch.Generator().manual_seed(_SEED)
+        self._features = torch.randn(1, len(cameras), grid**2, feature_dim, generator=generator)
+
+    def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
+        return []
+
+    def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
+        like = next(v for k, v in batch.items() if k.startswith("observation.") and isinstance(v, Tensor))
+        features = self._features.to(like.device).expand(like.shape[0], -1, -1, -1)
+        return GeometryFeatures(features, torch.ones(features.shape[:3], dtype=torch.bool, device=like.device))

@@ -1,0 +1,116 @@
+"""Geometry from depth cameras: metric depth -> point map -> per-cell statistics.
+
+Points in the robot's base frame say where things are whatever the camera's pose; in the camera frame they do not, and
+then help little more than no points at all (see docs/results.md).
+"""
+
+from collections.abc import Mapping
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
+
+from .camera import CameraCalibration, check_rigid, transform, unproject
+from .depth import check_measured, check_unit, to_metres
+from .source import GeometryFeatures, GeometrySource
+
+# Wavelengths of the Fourier features of a point, in metres: from a workspace down to the width of a finger.
+WAVELENGTHS = tuple(8.0 / 2**k for k in range(8))
+
+
+def depth_key(camera: str) -> str:
+    """Where the depth of a camera stands in a batch."""
+    return f"observation.images.{camera}_depth"
+
+
+def extrinsics_key(camera: str) -> str:
+    """Where the pose of a camera stands in a batch, if it comes with every frame."""
+    return f"observation.calibration.{camera}.extrinsics"
+
+
+class RgbdSource(GeometrySource):
+    """Per cell: mean point (3), spread (3), fraction of valid pixels (1), Fourier features of the mean (6 per wavelength).
+
+    calibration: per camera. sizes: (H, W) of each camera's depth. base_frame: points in the robot's base instead of
+    the camera. unit, max_depth: see `depth.to_metres`. Sources: Fourier features as in NeRF (Mildenhall et al., 2020),
+    with wavelengths in metres.
+    """
+
+    def __init__(
+        self,
+        cameras: tuple[str, ...],
+        grid: int,
+        calibration: Mapping[str, CameraCalibration],
+        sizes: Mapping[str, tuple[int, int]],
+        base_frame: bool,
+        unit: str,
+        max_depth: float,
+    ) -> None:
+        super().__init__()
+        self.cameras, self.grid = cameras, grid
+        self.feature_dim = 7 + 6 * len(WAVELENGTHS)
+        self.sizes, self.base_frame, self.unit, self.max_depth = dict(sizes), base_frame, unit, max_depth
+        self.calibration = {camera: calibration[camera] for camera in cameras}
+
+    def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
+        return [camera for camera in self.cameras if depth_key(camera) not in batch]
+
+    def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
+        present = [camera for camera in self.cameras if depth_key(camera) in batch]
+        if not present:
+            raise ValueError(f"No depth in the batch; expected {', '.join(depth_key(c) for c in self.cameras)}.")
+        measured = {camera: self._camera(camera, batch, check) for camera in present}
+        like = measured[present[0]]
+        absent = GeometryFeatures(torch.zeros_like(like.features), torch.zeros_like(like.valid))
+        views = [measured.get(camera, absent) for camera in self.cameras]
+        return GeometryFeatures(
+            torch.stack([view.features for view in views], dim=1), torch.stack([view.valid for view in views], dim=1)
+        )
+
+    def _camera(self, camera: str, batch: Mapping[str, Tensor], check: bool) -> GeometryFeatures:
+        """Features (B, G, C) and validity (B, G) of one camera."""
+        key = depth_key(camera)
+        raw, calibration = batch[key], self.calibration[camera]
+        depth, valid = to_metres(raw, key, self.unit, self.sizes[camera], self.max_depth)
+        if check:
+            check_unit(raw, key, self.unit)
+            if self.training:
+                check_measured(raw, key)
+        points = unproject(depth, torch.tensor(calibration.scaled_intrinsics(*depth.shape[-2:]), device=depth.device))
+        if self.base_frame:
+            points = transform(self._pose(camera, batch, check), points)
+        return cell_statistics(points, valid, self.grid)
+
+    def _pose(self, camera: str, batch: Mapping[str, Tensor], check: bool) -> Tensor:
+        """`base_T_camera`, (B, 4, 4) from the batch or (4, 4) from the calibration."""
+        key = extrinsics_key(camera)
+        if key in batch:
+            pose = batch[key]
+            if check:
+                check_rigid(pose, key)
+            return pose
+        extrinsics = self.calibration[camera].extrinsics
+        if extrinsics is None:
+            raise ValueError(
+                f"Camera '{camera}' has no extrinsics: neither {key} in the batch nor a pose in its calibration; give "
+                "one, or set --policy.geometry_frame=camera."
+            )
+        return torch.tensor(extrinsics, device=batch[depth_key(camera)].device)
+
+
+def cell_statistics(points: Tensor, valid: Tensor, grid: int) -> GeometryFeatures:
+    """Pool a point map (B, 3, H, W) with validity (B, 1, H, W) to grid x grid cells.
+
+    Returns features (B, grid², C), zeros where a cell has no valid pixel, and validity (B, grid²).
+    """
+    weight = valid.to(points.dtype)
+    points = points.masked_fill(~valid, 0.0)
+    fraction = F.adaptive_avg_pool2d(weight, grid)  # (B, 1, g, g)
+    share = fraction.clamp_min(torch.finfo(points.dtype).tiny)
+    mean = F.adaptive_avg_pool2d(points, grid) / share
+    square = F.adaptive_avg_pool2d(points.square(), grid) / share
+    spread = (square - mean.square()).clamp_min(0.0).sqrt()
+    angles = torch.cat([mean * (2 * torch.pi / wavelength) for wavelength in WAVELENGTHS], dim=1)
+    features = torch.cat([mean, spread, fraction, angles.sin(), angles.cos()], dim=1)
+    seen = (fraction > 0).flatten(2)  # (B, 1, G)
+    return GeometryFeatures(features.flatten(2).masked_fill(~seen, 0.0).mT, seen[:, 0])

@@ -1,0 +1,46 @@
+"""The contract between whatever measures geometry and the network."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from torch import Tensor, nn
+
+
+class GeometryFeatures(NamedTuple):
+    """Geometry of a batch of observations.
+
+    features: (B, V, G, C) float32, zeros where not valid. valid: (B, V, G) bool, False for a cell with no measurement
+    and for every cell of an absent camera. G is row-major over the grid, top-left cell first.
+    """
+
+    features: Tensor
+    valid: Tensor
+
+
+class GeometrySource(nn.Module, ABC):
+    """Turns an observation batch into per-cell features.
+
+    cameras: names of the V cameras in token order. grid: cells per side. feature_dim: C.
+    """
+
+    cameras: tuple[str, ...]
+    grid: int
+    feature_dim: int
+
+    @property
+    def num_tokens(self) -> int:
+        """V * G, the length of the geometry segment."""
+        return len(self.cameras) * self.grid**2
+
+    @abstractmethod
+    def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
+        """Cameras for which this batch brings nothing to measure."""
+
+    @abstractmethod
+    def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
+        """Features of a batch; a missing camera's cells are invalid.
+
+        batch: raw observation tensors under LeRobot's keys. check: look into the values (units, poses), which makes a
+        GPU wait; shapes and dtypes are always checked.
+        """

@@ -1,0 +1,114 @@
+"""What arrives from LeRobot, checked and put into the network's form: images, dataset statistics, calibration."""
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs import FeatureType, NormalizationMode
+from lerobot.policies.common.vla_utils import resize_with_pad_torch
+from torch import Tensor
+
+from .configuration_pi05_geometry import PI05GeometryConfig
+from .geometry import CameraCalibration, read_calibration_file
+from .geometry.calibration import CALIBRATION_FILE
+
+logger = logging.getLogger(__name__)
+
+_QUANTILES = {NormalizationMode.QUANTILES: ("q01", "q99"), NormalizationMode.QUANTILE10: ("q10", "q90")}
+
+
+def prepare_images(
+    batch: Mapping[str, Tensor], config: PI05GeometryConfig, device: torch.device
+) -> tuple[list[Tensor | None], list[Tensor]]:
+    """RGB cameras in the form SigLIP expects.
+
+    Images are (B, 3, H, W) or (B, H, W, 3), uint8 or float in [0, 1]; they are resized with black padding to
+    `image_resolution` and scaled to [-1, 1], as openpi does.
+
+    Returns per camera the images (B, 3, S, S) float32, or None for a camera that may be absent and is, and its mask (B,).
+    Raises ValueError for a camera that is missing or has a wrong shape.
+    """
+    images: list[Tensor | None] = []
+    masks = []
+    size = batch["observation.language.tokens"].shape[0]
+    for key in config.image_features:
+        absent = key not in batch
+        if absent and not config.may_be_absent(key):
+            raise ValueError(
+                f"The observation has no image {key}; connect the camera, rename its key with --rename_map, or, if "
+                f"this policy may run without it, list it in --policy.absent_cameras='[\"{key}\"]'."
+            )
+        images.append(None if absent else _prepare_image(batch[key].to(device), key, config))
+        masks.append(torch.full((size,), not absent, device=device))
+    return images, masks
+
+
+def _prepare_image(image: Tensor, key: str, config: PI05GeometryConfig) -> Tensor:
+    if image.ndim == 4 and image.shape[1] != 3 and image.shape[-1] == 3:
+        image = image.permute(0, 3, 1, 2)
+    if image.ndim != 4 or image.shape[1] != 3:
+        raise ValueError(f"{key} must be RGB images (B, 3, H, W), got shape {tuple(image.shape)}.")
+    image = image.float() / 255 if image.dtype == torch.uint8 else image.float()
+    if tuple(image.shape[-2:]) != tuple(config.image_resolution):
+        image = resize_with_pad_torch(image, *config.image_resolution)
+    return image * 2.0 - 1.0
+
+
+def check_stats(config: PI05GeometryConfig, stats: Mapping[str, Mapping[str, Any]]) -> None:
+    """Check that the dataset statistics can normalise what `normalization_mapping` wants normalised.
+
+    LeRobot divides by an epsilon where two quantiles coincide, which turns any other value into millions. A dimension
+    that is constant throughout is harmless and only reported.
+
+    Raises ValueError naming the feature, the dimension and what to do.
+    """
+    features = {**(config.input_features or {}), **(config.output_features or {})}
+    for key, feature in features.items():
+        mode = config.normalization_mapping.get(FeatureType(feature.type).value, NormalizationMode.IDENTITY)
+        if mode not in _QUANTILES or key not in stats:
+            continue
+        low_name, high_name = _QUANTILES[mode]
+        if low_name not in stats[key] or high_name not in stats[key]:
+            raise ValueError(
+                f"The dataset has no {low_name}/{high_name} statistics for {key}, which {mode.value} normalisation needs; "
+                "add them with LeRobot's augment_dataset_quantile_stats.py, or choose another --policy.normalization_mapping."
+            )
+        low, high = (torch.as_tensor(stats[key][name]).flatten().double() for name in (low_name, high_name))
+        for dim in (high <= low).nonzero().flatten().tolist():
+            values = [torch.as_tensor(stats[key][n]).flatten()[dim].item() for n in ("min", "max") if n in stats[key]]
+            if len(values) == 2 and values[0] == values[1]:
+                logger.warning("%s[%d] is constant (%g) in the dataset; it carries no information.", key, dim, values[0])
+                continue
+            raise ValueError(
+                f"{key}[{dim}] has {low_name} = {high_name} = {low[dim].item():g} although it is not constant, so its "
+                f"{mode.value} normalisation has no width; drop the dimension, or use MEAN_STD or MIN_MAX in "
+                "--policy.normalization_mapping."
+            )
+
+
+def resolve_calibration(config: PI05GeometryConfig, dataset_meta: Any | None) -> dict[str, CameraCalibration]:
+    """The calibration to use: the file given, else the dataset's, else what the checkpoint recorded.
+
+    The caller stores it in the configuration, so that a checkpoint carries it wherever it goes.
+    """
+    if config.calibration_path is not None:
+        return read_calibration_file(config.calibration_path)
+    if dataset_meta is not None:
+        path = Path(dataset_meta.root) / "meta" / CALIBRATION_FILE
+        if path.is_file():
+            return read_calibration_file(path)
+    return config.calibration
+
+
+def check_calibration(config: PI05GeometryConfig, cameras: list[str]) -> None:
+    """Raise ValueError unless every depth camera has usable intrinsics."""
+    for camera in cameras:
+        if camera not in config.calibration:
+            known = ", ".join(sorted(config.calibration)) or "no camera"
+            raise ValueError(
+                f"Depth camera '{camera}' has no intrinsics (the calibration has {known}); give a calibration file with "
+                "--policy.calibration_path, or put it at meta/calibration.json of the dataset."
+            )
+        config.calibration[camera].check(camera)

@@ -1,0 +1,56 @@
+"""Flow matching: the noise, the flow time and the dropout draw of a training sample.
+
+Convention (openpi): flow time 1 is noise, 0 is the clean action; x_t = t * noise + (1 - t) * action and the network
+predicts the velocity noise - action.
+
+LeRobot draws the data order from torch's global generator, so a resumed run would draw other noise than one that never
+stopped. Here every draw is a function of (seed, step, dataset index) alone, through numpy's counter-based Philox
+generator: a resumed run, or another number of processes, draws the same.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+_MASK = (1 << 64) - 1
+
+
+class FlowDraw(NamedTuple):
+    """What is random about a training batch, on the CPU."""
+
+    noise: Tensor  # (B, S, D) float32, standard normal
+    time: Tensor  # (B,) float32 in (0, 1]
+    dropout: Tensor  # (B,) float32, uniform in [0, 1)
+
+
+def draw_flow(
+    seed: int,
+    step: int,
+    indices: list[int],
+    shape: tuple[int, int],
+    *,
+    alpha: float,
+    beta: float,
+    scale: float,
+    offset: float,
+) -> FlowDraw:
+    """Draw noise, flow time Beta(alpha, beta) * scale + offset, and a uniform number for each dataset index.
+
+    seed: of the run. step: optimiser steps done so far. indices: dataset index of each of the B samples.
+    shape: (S, D) of one action chunk. Returns a `FlowDraw`.
+    """
+    noise, time, dropout = [], [], []
+    for index in indices:
+        generator = np.random.Generator(
+            np.random.Philox(key=[seed & _MASK, index & _MASK], counter=[0, 0, 0, step & _MASK])
+        )
+        noise.append(generator.standard_normal(shape, dtype=np.float32))
+        time.append(generator.beta(alpha, beta) * scale + offset)
+        dropout.append(generator.random())
+    return FlowDraw(
+        torch.from_numpy(np.stack(noise)),
+        torch.tensor(time, dtype=torch.float32),
+        torch.tensor(dropout, dtype=torch.float32),
+    )

@@ -1,0 +1,193 @@
+"""One Gemma transformer layer of one segment: the same code trains, prefills and denoises.
+
+A segment sees whole earlier segments and itself, never a later one. So a layer runs segment by segment: each computes
+its own queries, keys and values, attends to the keys that the earlier segments left behind plus its own, and hands
+both on. Whether "left behind" means a concatenation (training) or a preallocated cache (inference) is one line.
+
+Parameter names are those of LeRobot's π0.5. Shapes: B batch, N tokens of the segment, W width, H heads, KV key/value
+heads, D head_dim, K keys up to the segment's end.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from .attention import Attention, apply_rotary
+from .cache import CacheSlot
+from .precision import Float32Linear, Float32Module
+from .variants import GemmaVariant
+
+RMS_EPS = 1e-6
+
+
+class KeysValues(NamedTuple):
+    """Keys and values up to the end of a segment, each (B, KV, K, D)."""
+
+    keys: Tensor
+    values: Tensor
+
+
+class RMSNorm(Float32Module):
+    """x / rms(x) * (1 + weight), computed in float32, returned in x's dtype, with no residual gate."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(width))
+
+    def forward(self, x: Tensor, cond: Tensor | None = None) -> tuple[Tensor, None]:
+        """x (B, N, W) -> (B, N, W) and None."""
+        return (_normalise(x) * (1.0 + self.weight)).to(x.dtype), None
+
+
+class AdaRMSNorm(nn.Module):
+    """RMSNorm whose scale, shift and residual gate come from the flow time (adaRMS, π0.5)."""
+
+    def __init__(self, width: int, cond_dim: int) -> None:
+        super().__init__()
+        self.dense = Float32Linear(cond_dim, 3 * width)
+        nn.init.zeros_(self.dense.weight)
+
+    def forward(self, x: Tensor, cond: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """x (B, N, W), cond (B or 1, cond_dim) float32 -> (B, N, W) and the gate (B or 1, 1, W), both in x's dtype."""
+        if cond is None:
+            raise ValueError("An adaptive norm needs `adarms_cond`, the embedded flow time of its segment.")
+        scale, shift, gate = self.dense(cond)[:, None].chunk(3, dim=-1)
+        return (_normalise(x) * (1.0 + scale) + shift).to(x.dtype), gate.to(x.dtype)
+
+
+def _normalise(x: Tensor) -> Tensor:
+    x = x.float()
+    return x * torch.rsqrt(x.square().mean(dim=-1, keepdim=True) + RMS_EPS)
+
+
+def _add(residual: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
+    update = update.to(residual.dtype)
+    return residual + (update if gate is None else update * gate)
+
+
+class GemmaAttention(nn.Module):
+    """Projections of a layer's attention, and the attention itself."""
+
+    def __init__(self, variant: GemmaVariant) -> None:
+        super().__init__()
+        self.head_dim = variant.head_dim
+        q_dim, kv_dim = variant.num_heads * variant.head_dim, variant.num_kv_heads * variant.head_dim
+        self.q_proj = nn.Linear(variant.width, q_dim, bias=False)
+        self.k_proj = nn.Linear(variant.width, kv_dim, bias=False)
+        self.v_proj = nn.Linear(variant.width, kv_dim, bias=False)
+        self.o_proj = nn.Linear(q_dim, variant.width, bias=False)
+        self.attention = Attention()
+
+    def heads(self, projected: Tensor) -> Tensor:
+        """(B, N, heads * D) -> (B, heads, N, D)."""
+        return projected.unflatten(-1, (-1, self.head_dim)).transpose(1, 2)
+
+
+class GemmaMLP(nn.Module):
+    """Gated GELU feed-forward, (B, N, W) -> (B, N, W)."""
+
+    def __init__(self, variant: GemmaVariant) -> None:
+        super().__init__()
+        self.gate_proj = nn.Linear(variant.width, variant.mlp_dim, bias=False)
+        self.up_proj = nn.Linear(variant.width, variant.mlp_dim, bias=False)
+        self.down_proj = nn.Linear(variant.mlp_dim, variant.width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.down_proj(F.gelu(self.gate_proj(x), approximate="tanh") * self.up_proj(x))
+
+
+class GemmaLayer(nn.Module):
+    """Attention and feed-forward of one segment in one layer; `cond_dim` makes its norms adaptive."""
+
+    def __init__(self, variant: GemmaVariant, cond_dim: int | None) -> None:
+        super().__init__()
+        self.self_attn = GemmaAttention(variant)
+        self.mlp = GemmaMLP(variant)
+        self.input_layernorm = make_norm(variant.width, cond_dim)
+        self.post_attention_layernorm = make_norm(variant.width, cond_dim)
+
+    def forward(
+        self,
+        x: Tensor,
+        rotary: tuple[Tensor, Tensor],
+        mask: Tensor,
+        cond: Tensor | None = None,
+        bias: Tensor | None = None,
+        earlier: KeysValues | None = None,
+        slot: CacheSlot | None = None,
+        output: bool = True,
+    ) -> tuple[Tensor | None, KeysValues]:
+        """Run the segment through the layer.
+
+        x (B, N, W); rotary cos and sin (B, N, D/2); mask (B, 1 or N, K) bool; cond (B or 1, cond_dim) float32;
+        bias (H, K) float32; earlier: keys and values of the earlier segments, where there is no cache; slot: the
+        segment's place in the cache; output=False stops after the keys and values, which is all that the last layer
+        of prefix and geometry is needed for.
+
+        Returns the hidden states (B, N, W) or None, and the keys and values up to the segment's end.
+        """
+        attn = self.self_attn
+        normed, gate = self.input_layernorm(x, cond)
+        keys = apply_rotary(attn.heads(attn.k_proj(normed)), *rotary)
+        values = attn.heads(attn.v_proj(normed))
+        if slot is not None:
+            seen = KeysValues(*slot.write(keys, values))
+        elif earlier is not None:
+            seen = KeysValues(torch.cat([earlier.keys, keys], dim=2), torch.cat([earlier.values, values], dim=2))
+        else:
+            seen = KeysValues(keys, values)
+        if not output:
+            return None, seen
+
+        queries = apply_rotary(attn.heads(attn.q_proj(normed)), *rotary)
+        attended = attn.attention(queries, seen.keys, seen.values, mask, bias)  # (B, H, N, D)
+        x = _add(x, attn.o_proj(attended.transpose(1, 2).flatten(2)), gate)
+        normed, gate = self.post_attention_layernorm(x, cond)
+        return _add(x, self.mlp(normed), gate), seen
+
+
+def make_norm(width: int, cond_dim: int | None) -> RMSNorm | AdaRMSNorm:
+    """The plain norm of the VLM, or the adaptive one of an expert."""
+    return RMSNorm(width) if cond_dim is None else AdaRMSNorm(width, cond_dim)
+
+
+class GemmaModel(nn.Module):
+    """The parameters of one Gemma transformer; `PaliGemmaWithExpert` runs its layers.
+
+    `vocab_size` adds the token embedding, `cond_dim` makes the norms adaptive. No `lm_head` is built: π0.5 never reads
+    one, and LeRobot spends 19 % of its memory on two.
+    """
+
+    def __init__(self, variant: GemmaVariant, vocab_size: int | None = None, cond_dim: int | None = None) -> None:
+        super().__init__()
+        self.variant = variant
+        if vocab_size is not None:
+            self.embed_tokens = nn.Embedding(vocab_size, variant.width)
+        self.layers = nn.ModuleList(GemmaLayer(variant, cond_dim) for _ in range(variant.depth))
+        self.norm = make_norm(variant.width, cond_dim)
+        self.apply(_init_weights)
+
+    def embed(self, tokens: Tensor) -> Tensor:
+        """Token ids (B, L) -> embeddings (B, L, W) times sqrt(W), as Gemma does."""
+        embeddings = self.embed_tokens(tokens)
+        return embeddings * torch.tensor(self.variant.width**0.5, dtype=embeddings.dtype)
+
+    def freeze_unread_output(self) -> None:
+        """Freeze what feeds nothing when only keys and values of the last layer are read.
+
+        These weights load and save like any other; without a gradient they would fail DDP.
+        """
+        last = self.layers[-1]
+        for module in (last.self_attn.q_proj, last.self_attn.o_proj, last.mlp, last.post_attention_layernorm, self.norm):
+            module.requires_grad_(False)
+
+
+def _init_weights(module: nn.Module) -> None:
+    """Gemma's initialisation, normal(0.02); norms start at zero, so that adaRMS starts as the identity."""
+    if isinstance(module, nn.Embedding) or (isinstance(module, nn.Linear) and not isinstance(module, Float32Linear)):
+        nn.init.normal_(module.weight, std=0.02)
+    elif isinstance(module, AdaRMSNorm):
+        nn.init.zeros_(module.dense.weight)
+        nn.init.zeros_(module.dense.bias)

@@ -1,0 +1,114 @@
+"""Who sees whom, and at which position.
+
+```
+   queries, keys  prefix   geometry   suffix
+   prefix           x         .          .       the pretrained VLM never sees geometry: nothing disturbs it
+   geometry         x         x          .       geometry reads the scene and the instruction
+   suffix           x         x          x       actions read everything
+```
+
+openpi's convention for `att_masks`: token j is visible to token i when the cumulative sum of the entries up to j is not
+above that up to i. A 1 opens a block that earlier tokens cannot see, a 0 joins the block before. Geometry and suffix
+must each open a block of their own:
+
+```
+   prefix 0 0 0 0 | geometry 1 0 0 | suffix 1 0 0        cumulative sum  0 0 0 0 | 1 1 1 | 2 2 2
+   prefix 0 0 0 0 | geometry 0 0 0 | ...                 wrong: geometry joins the prefix, and the VLM sees it
+```
+
+So a segment sees whole earlier segments and itself, and its attention mask is a rectangle: its own rows, the columns
+up to its end. When a segment is one block (always, unless `geom_att` says otherwise) the rectangle depends on the key
+alone and is kept as one row, (B, 1, K). Keys are masked, never queries: a query row with every key masked turns into
+NaN inside softmax, and NaN x 0 spreads.
+
+Shapes: B batch, N tokens, P|G|S tokens of the three segments, Q query tokens, K key tokens.
+"""
+
+from collections.abc import Sequence
+from enum import IntEnum
+from itertools import accumulate
+
+import torch
+from torch import Tensor
+
+from .config import GeometryPositions
+
+
+class Segment(IntEnum):
+    """The three segments, in the order in which they stand in the sequence."""
+
+    PREFIX = 0
+    GEOMETRY = 1
+    SUFFIX = 2
+
+
+AttMasks = Sequence[int]
+
+
+def one_block(length: int) -> list[int]:
+    """`att_masks` of a segment that opens a block of its own: 1 0 0 ... (empty for no tokens)."""
+    return [1] + [0] * (length - 1) if length else []
+
+
+def make_att_mask(pad_masks: Tensor, att_masks: AttMasks) -> Tensor:
+    """Square attention mask of a whole sequence, the reference that the rectangles are cut from.
+
+    pad_masks: (B, N) bool, True for real tokens. att_masks: N entries, see the module's text.
+    Returns (B, N, N) bool, [b, query, key]. Source: openpi `make_attn_mask`, but masking keys only.
+    """
+    block = torch.tensor(list(accumulate(att_masks)), device=pad_masks.device)  # (N,)
+    visible = block[None, :] <= block[:, None]  # (N, N)
+    return visible[None] & pad_masks[:, None, :]
+
+
+def segment_mask(segment: Segment, pads: Sequence[Tensor | None], atts: Sequence[AttMasks | None]) -> Tensor:
+    """Attention mask of one segment's queries against the keys of all segments up to its own.
+
+    pads, atts: per segment, (B, N_i) bool and N_i entries; None for an absent segment.
+    Returns (B, 1, K) bool where every query of the segment sees the same keys, else (B, Q, K).
+    """
+    present = [s for s in Segment if s <= segment and pads[s] is not None]
+    keys = torch.cat([pads[s] for s in present], dim=1)  # (B, K)
+    lengths = [pads[s].shape[1] for s in present]  # type: ignore[union-attr]
+    flat = [int(entry) for s in present for entry in (atts[s] or [])]
+    if len(flat) != sum(lengths):
+        raise ValueError(f"att_masks need one entry per token: {sum(lengths)} tokens, {len(flat)} entries.")
+    blocks = list(accumulate(flat))
+    start = sum(lengths[:-1])
+    if start and lengths[-1] and blocks[start] == blocks[start - 1]:
+        raise ValueError(
+            f"The first token of the {segment.name.lower()} segment must have att_mask 1: with 0 it joins the "
+            "block before it, which then sees it too."
+        )
+    own = blocks[start:]
+    if not own or own[0] == own[-1]:
+        return keys[:, None, :]
+    return make_att_mask(keys, flat)[:, start:]
+
+
+def segment_positions(pads: Sequence[Tensor | None], rule: GeometryPositions) -> list[Tensor | None]:
+    """Rotary positions of each segment.
+
+    sequential: cumsum over P|G|S - 1, so geometry moves the suffix, and so does a hole in it.
+    parallel: the suffix counts P|S, as if geometry were not there; cell i stands at the first position after the
+        prefix plus i, whether or not the cells before it are holes.
+
+    pads: per segment (B, N_i) bool or None. Returns per segment (B, N_i) int64 or None.
+    """
+    prefix, geometry, suffix = pads
+    after: Tensor | int = 0  # position of the next real token, (B, 1)
+    positions: list[Tensor | None] = [None, None, None]
+    if prefix is not None:
+        positions[Segment.PREFIX] = prefix.cumsum(dim=1) - 1
+        after = prefix.sum(dim=1, keepdim=True)
+    if geometry is not None:
+        if rule == "parallel":
+            positions[Segment.GEOMETRY] = after + torch.arange(
+                geometry.shape[1], device=geometry.device
+            ).expand_as(geometry)
+        else:
+            positions[Segment.GEOMETRY] = after + geometry.cumsum(dim=1) - 1
+            after = after + geometry.sum(dim=1, keepdim=True)
+    if suffix is not None:
+        positions[Segment.SUFFIX] = after + suffix.cumsum(dim=1) - 1
+    return positions

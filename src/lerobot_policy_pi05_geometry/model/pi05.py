@@ -1,0 +1,269 @@
+"""π0.5 with a geometry segment: embed, train, sample. Names and argument order are those of π0.5 code bases.
+
+Shapes: B batch, V cameras, L prompt tokens, P|G|S tokens of prefix, geometry and suffix, D max_action_dim, W_vlm and
+W expert width.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from lerobot.policies.common.flow_matching import euler_integrate
+from torch import Tensor, nn
+
+from .cache import SegmentKVCache
+from .config import NetworkConfig
+from .layout import AttMasks, Segment, one_block, segment_mask, segment_positions
+from .paligemma_with_expert import PaliGemmaWithExpert
+from .precision import Float32Linear, compute_in
+
+
+class SegmentTokens(NamedTuple):
+    """Tokens of one segment: padding mask (B, N) bool, openpi's att_masks (N entries), and embeddings (B, N, W).
+
+    The embeddings are None where the segment's keys and values are read from the cache.
+    """
+
+    embs: Tensor | None
+    pad: Tensor
+    att: AttMasks
+
+
+class PI05Pytorch(nn.Module):
+    """The network. Images in [-1, 1], actions normalised, everything a tensor; losses and actions out."""
+
+    def __init__(self, config: NetworkConfig, rtc_processor=None) -> None:
+        super().__init__()
+        self.config = config
+        self.rtc_processor = rtc_processor
+        width = config.expert.width
+        self.paligemma_with_expert = PaliGemmaWithExpert(config)
+        self.action_in_proj = Float32Linear(config.max_action_dim, width)
+        self.action_out_proj = Float32Linear(width, config.max_action_dim)
+        self.time_mlp_in = Float32Linear(width, width)
+        self.time_mlp_out = Float32Linear(width, width)
+
+    @property
+    def geometry_width(self) -> int:
+        """Width that geometry tokens must have: the expert's, or the VLM's if they stand in its prefix."""
+        geometry = self.config.geometry
+        in_prefix = geometry is not None and geometry.placement == "prefix"
+        return self.config.paligemma.gemma.width if in_prefix else self.config.expert.width
+
+    def gradient_checkpointing_enable(self) -> None:
+        """Recompute each layer once in the backward pass (a layer then runs twice per training step)."""
+        self.paligemma_with_expert.gradient_checkpointing = True
+        self.paligemma_with_expert.paligemma.model.vision_tower.gradient_checkpointing_enable(
+            {"use_reentrant": False, "preserve_rng_state": False}
+        )
+
+    def embed_prefix(
+        self, images: Sequence[Tensor | None], img_masks: Sequence[Tensor], tokens: Tensor, masks: Tensor
+    ) -> SegmentTokens:
+        """Vision and text.
+
+        images: per camera (B, 3, H, W) in [-1, 1], or None for a camera that is absent, which is not encoded.
+        img_masks: per camera (B,) bool. tokens: (B, L) ids. masks: (B, L) bool.
+        Returns embeddings (B, P, W_vlm) with zeros in padded slots, their mask, and P zeros.
+        """
+        network = self.paligemma_with_expert
+        text = network.embed_language_tokens(tokens.masked_fill(~masks, 0))
+        embs, pads = [], []
+        present = [(image, mask) for image, mask in zip(images, img_masks, strict=True) if image is not None]
+        if present:
+            patches = network.embed_image(torch.cat([image for image, _ in present]))  # (V * B, patches, W_vlm)
+            embs = list(patches.chunk(len(present)))
+            pads = [mask[:, None].expand(-1, patches.shape[1]) for _, mask in present]
+        pad = torch.cat([*pads, masks], dim=1)
+        embedded = torch.cat([*(e.to(text.dtype) for e in embs), text], dim=1)
+        return SegmentTokens(_silence(embedded, pad), pad, [0] * pad.shape[1])
+
+    def embed_time(self, timestep: Tensor) -> Tensor:
+        """Flow time (B,) -> adaRMS condition (B, W) float32: sine-cosine embedding in float64, then an MLP."""
+        width = self.action_in_proj.out_features
+        exponent = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float64, device=timestep.device)
+        period = self.config.min_period * (self.config.max_period / self.config.min_period) ** exponent
+        angle = timestep[:, None].double() * (2 * math.pi / period)
+        embedded = torch.cat([angle.sin(), angle.cos()], dim=1).float()
+        return F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(embedded))))
+
+    def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> tuple[Tensor, Tensor, AttMasks, Tensor]:
+        """Noisy actions (B, S, D) and flow time (B,) -> embeddings (B, S, W), mask (B, S), att_masks, adaRMS condition."""
+        embs = self.action_in_proj(noisy_actions)
+        pad = torch.ones(embs.shape[:2], dtype=torch.bool, device=embs.device)
+        return embs, pad, one_block(embs.shape[1]), self.embed_time(timestep)
+
+    def forward(
+        self,
+        images: Sequence[Tensor | None],
+        img_masks: Sequence[Tensor],
+        tokens: Tensor,
+        masks: Tensor,
+        actions: Tensor,
+        noise: Tensor,
+        time: Tensor,
+        geom_embs: Tensor | None = None,
+        geom_pad: Tensor | None = None,
+        geom_att: AttMasks | None = None,
+    ) -> Tensor:
+        """Flow-matching loss of every action entry, unreduced, (B, S, D) float32.
+
+        actions, noise: (B, S, D). time: (B,). geom_embs: (B, G, W) tokens of the geometry adapter, geom_pad: (B, G)
+        bool, False for a hole, geom_att: G entries, one block by default. The rest as in `embed_prefix`.
+        """
+        t = time[:, None, None]
+        with compute_in(self.config.dtype, tokens.device):
+            prefix, geometry = self._context(images, img_masks, tokens, masks, geom_embs, geom_pad, geom_att)
+            embs, pad, att, cond = self.embed_suffix(t * noise + (1 - t) * actions, time)
+            output, _ = self._run([prefix, geometry, SegmentTokens(embs, pad, att)], cond)
+            velocity = self.action_out_proj(output)
+        return F.mse_loss(velocity, noise - actions, reduction="none")
+
+    @torch.no_grad()
+    def sample_actions(
+        self,
+        images: Sequence[Tensor | None],
+        img_masks: Sequence[Tensor],
+        tokens: Tensor,
+        masks: Tensor,
+        noise: Tensor | None = None,
+        num_steps: int | None = None,
+        geom_embs: Tensor | None = None,
+        geom_pad: Tensor | None = None,
+        geom_att: AttMasks | None = None,
+        use_cache: bool = True,
+        inference_delay: int | None = None,
+        prev_chunk_left_over: Tensor | None = None,
+        execution_horizon: int | None = None,
+    ) -> Tensor:
+        """Integrate the flow from noise to an action chunk, (B, S, D) float32.
+
+        noise: (B, S, D), drawn here if None. num_steps: Euler steps, the configured number if None.
+        use_cache=False recomputes every segment at every step: the slow reference that caching must equal.
+        The last three arguments are LeRobot's real-time chunking (RTC). The rest as in `forward`.
+        """
+        config = self.config
+        if noise is None:
+            noise = torch.randn(tokens.shape[0], config.chunk_size, config.max_action_dim, device=tokens.device)
+        with compute_in(config.dtype, tokens.device):
+            prefix, geometry = self._context(images, img_masks, tokens, masks, geom_embs, geom_pad, geom_att)
+            cache = self._prefill(prefix, geometry, noise.shape[1]) if use_cache else None
+            rtc = self.rtc_processor
+            return euler_integrate(
+                lambda x_t, timestep: self._velocity(prefix, geometry, cache, x_t, timestep),
+                noise,
+                num_steps or config.num_inference_steps,
+                rtc_processor=rtc,
+                rtc_enabled=rtc is not None and rtc.rtc_config.enabled,
+                inference_delay=inference_delay,
+                prev_chunk_left_over=prev_chunk_left_over,
+                execution_horizon=execution_horizon,
+            )
+
+    def denoise_step(
+        self,
+        prefix_pad_masks: Tensor,
+        past_key_values: SegmentKVCache,
+        x_t: Tensor,
+        timestep: Tensor,
+        geometry: SegmentTokens | None = None,
+    ) -> Tensor:
+        """One step from a filled cache: velocity (B, S, D) float32 at x_t (B, S, D) and flow time (B,).
+
+        prefix_pad_masks: (B, P) bool, as cached. geometry: the geometry segment that was cached, or None.
+        """
+        prefix = SegmentTokens(None, prefix_pad_masks, [0] * prefix_pad_masks.shape[1])
+        return self._velocity(prefix, geometry, past_key_values, x_t, timestep)
+
+    @torch.no_grad()
+    def _velocity(
+        self,
+        prefix: SegmentTokens,
+        geometry: SegmentTokens | None,
+        cache: SegmentKVCache | None,
+        x_t: Tensor,
+        timestep: Tensor,
+    ) -> Tensor:
+        """Velocity of the flow, from the cache or, without one, from every segment anew.
+
+        `no_grad` although LeRobot's RTC calls this under `enable_grad`: its guidance uses no Jacobian of the network,
+        and in-place cache writes must not chain graphs.
+        """
+        with compute_in(self.config.dtype, x_t.device):
+            embs, pad, att, cond = self.embed_suffix(x_t, timestep)
+            given = [True, True, True] if cache is None else [False, self._geometry_follows_time, True]
+            output, _ = self._run([prefix, geometry, SegmentTokens(embs, pad, att)], cond, cache, given)
+            return self.action_out_proj(output)
+
+    @property
+    def _geometry_follows_time(self) -> bool:
+        return self.config.geometry is not None and self.config.geometry.time == "denoise"
+
+    def _context(
+        self,
+        images: Sequence[Tensor | None],
+        img_masks: Sequence[Tensor],
+        tokens: Tensor,
+        masks: Tensor,
+        geom_embs: Tensor | None,
+        geom_pad: Tensor | None,
+        geom_att: AttMasks | None,
+    ) -> tuple[SegmentTokens, SegmentTokens | None]:
+        """The two segments that do not depend on the actions."""
+        prefix = self.embed_prefix(images, img_masks, tokens, masks)
+        if geom_embs is None:
+            return prefix, None
+        if self.config.geometry is None:
+            raise ValueError("This network was built without geometry (`geometry_source=none`); it cannot use geom_embs.")
+        if geom_embs.shape[-1] != self.geometry_width:
+            raise ValueError(f"geom_embs need width {self.geometry_width}, got {geom_embs.shape[-1]}.")
+        pad = torch.ones(geom_embs.shape[:2], dtype=torch.bool, device=geom_embs.device) if geom_pad is None else geom_pad
+        embs = _silence(geom_embs, pad)
+        if self.config.geometry.placement == "prefix":
+            joined = torch.cat([prefix.embs, embs.to(prefix.embs.dtype)], dim=1)
+            return SegmentTokens(joined, torch.cat([prefix.pad, pad], dim=1), [0] * joined.shape[1]), None
+        return prefix, SegmentTokens(embs, pad, one_block(embs.shape[1]) if geom_att is None else geom_att)
+
+    def _prefill(self, prefix: SegmentTokens, geometry: SegmentTokens | None, suffix_length: int) -> SegmentKVCache:
+        """Run prefix and (clean) geometry once and keep their keys and values."""
+        lengths = [prefix.pad.shape[1], 0 if geometry is None else geometry.pad.shape[1], suffix_length]
+        cache = self.paligemma_with_expert.make_cache(prefix.pad.shape[0], lengths, prefix.embs)
+        self._run([prefix, geometry, None], None, cache, [True, not self._geometry_follows_time, False])
+        return cache
+
+    def _run(
+        self,
+        segments: Sequence[SegmentTokens | None],
+        suffix_cond: Tensor | None,
+        cache: SegmentKVCache | None = None,
+        given: Sequence[bool] = (True, True, True),
+    ) -> tuple[Tensor | None, SegmentKVCache | None]:
+        """Run the given ones of these segments; the others are in the cache. Returns the suffix's output (B, S, W)."""
+        pads = [None if s is None else s.pad for s in segments]
+        atts = [None if s is None else s.att for s in segments]
+        inputs = [s if keep else None for s, keep in zip(segments, given, strict=True)]
+        geometry = self.config.geometry
+        positions = segment_positions(pads, geometry.positions if geometry else "sequential")
+        outputs, cache = self.paligemma_with_expert(
+            attention_mask=[None if inputs[s] is None else segment_mask(s, pads, atts) for s in Segment],
+            position_ids=positions,
+            past_key_values=cache,
+            inputs_embeds=[None if s is None else s.embs for s in inputs],
+            use_cache=cache is not None,
+            adarms_cond=[None, self._geometry_cond(inputs[Segment.GEOMETRY], suffix_cond), suffix_cond],
+            outputs=(False, False, True),
+        )
+        return outputs[Segment.SUFFIX], cache
+
+    def _geometry_cond(self, geometry: SegmentTokens | None, suffix_cond: Tensor | None) -> Tensor | None:
+        """Geometry is a clean observation, so it is conditioned on the clean end of the flow, time 0: (1, W)."""
+        if geometry is None or self._geometry_follows_time:
+            return suffix_cond
+        return self.embed_time(torch.zeros(1, device=geometry.embs.device))
+
+
+def _silence(embs: Tensor, pad: Tensor) -> Tensor:
+    """Zero padded slots: a masked key cannot act, but NaN in it would (NaN + -inf is NaN)."""
+    return embs.masked_fill(~pad[..., None], 0)

@@ -1,0 +1,283 @@
+"""The policy: LeRobot's batches in, losses and actions out.
+
+```
+   batch ──► prepare_images ─► prefix ─┐
+         ──► tokens ─────────► prefix ─┤
+         ──► GeometryEncoder ► geometry┼─► PI05Pytorch ─► loss, or an action chunk
+         ──► action, or noise ► suffix ┘
+```
+"""
+
+import logging
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import init_empty_weights
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.common.vla_utils import pad_vector
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.policies.rtc.modeling_rtc import RTCProcessor
+from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from torch import Tensor, nn
+
+from .checkpoints import find_file, load_strictly, require_policy_type
+from .configuration_pi05_geometry import PI05GeometryConfig
+from .geometry import GeometryEncoder, GeometrySource
+from .geometry.random_tokens import RandomSource
+from .geometry.rgbd import RgbdSource
+from .inputs import check_calibration, check_stats, prepare_images, resolve_calibration
+from .model import PI05Pytorch
+from .model.flow import FlowDraw, draw_flow
+
+logger = logging.getLogger(__name__)
+
+_EVALUATION_STEP = -1  # evaluation loss draws the same noise at every training step, so that its curve is comparable
+
+
+class PI05GeometryPolicy(PreTrainedPolicy):
+    """π0.5 with a geometry segment, as a LeRobot policy."""
+
+    config_class = PI05GeometryConfig
+    name = "pi05_geometry"
+
+    def __init__(
+        self,
+        config: PI05GeometryConfig,
+        dataset_stats: dict[str, dict[str, Any]] | None = None,
+        dataset_meta: Any | None = None,
+        **_: Any,
+    ) -> None:
+        """dataset_stats, dataset_meta: what LeRobot's `make_policy` passes; the rest of it is not needed."""
+        super().__init__(config)
+        config.validate_features()
+        if dataset_stats:
+            check_stats(config, dataset_stats)
+        self.config: PI05GeometryConfig = config
+        self.init_rtc_processor()
+        self.model = PI05Pytorch(config.network(), self.rtc_processor)
+        source = self._build_source(dataset_meta)
+        self.geometry = None if source is None else GeometryEncoder(source, self.model.geometry_width)
+        self._set_trainable()
+        if config.gradient_checkpointing:
+            self.model.gradient_checkpointing_enable()
+        # Optimiser steps done, kept in the checkpoint: noise is keyed by it (see model/flow.py).
+        self.register_buffer("training_step", torch.zeros((), dtype=torch.int64))
+        self._noise_seed = torch.initial_seed()
+        self._last_update: dict[str, Tensor] = {}
+        self.to(config.device)
+        self.reset()
+
+    def _build_source(self, dataset_meta: Any | None) -> GeometrySource | None:
+        """The geometry source that the configuration names; records the calibration in the configuration."""
+        config = self.config
+        if config.geometry_source == "none":
+            return None
+        sizes = config.depth_cameras()
+        if config.geometry_source == "random":
+            cameras = tuple(sizes) or tuple(key.rsplit(".", 1)[-1] for key in config.image_features)
+            return RandomSource(cameras, config.geometry_grid)
+        if not sizes:
+            raise ValueError(
+                "geometry_source=rgbd needs depth, but the data has no observation.images.<camera>_depth; record depth "
+                "(LeRobot: use_depth=true on the camera), or train with --policy.geometry_source=none."
+            )
+        config.calibration = resolve_calibration(config, dataset_meta)
+        config.calibration_path = None  # the checkpoint now carries the content
+        check_calibration(config, list(sizes))
+        return RgbdSource(
+            tuple(sizes),
+            config.geometry_grid,
+            config.calibration,
+            sizes,
+            base_frame=config.geometry_frame == "base",
+            unit=config.depth_unit,
+            max_depth=config.max_depth,
+        )
+
+    def _set_trainable(self) -> None:
+        network = self.model.paligemma_with_expert
+        network.set_trainable(self.config.train_expert_only, self.config.freeze_vision_encoder)
+        if not self.config.image_features:  # a policy without RGB runs no vision tower, so it must not wait for its gradient
+            network.paligemma.model.vision_tower.requires_grad_(False)
+            network.paligemma.model.multi_modal_projector.requires_grad_(False)
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        config: PreTrainedConfig | None = None,
+        force_download: bool = False,
+        resume_download: bool | None = None,
+        proxies: dict | None = None,
+        token: str | bool | None = None,
+        cache_dir: str | Path | None = None,
+        local_files_only: bool = False,
+        revision: str | None = None,
+        strict: bool = True,
+        **kwargs: Any,
+    ) -> "PI05GeometryPolicy":
+        """Load a policy from a folder or the hub, in evaluation mode. Its weights load whole, or this raises.
+
+        strict: kept for LeRobot's signature; loading is always strict.
+        """
+        hub = {
+            "force_download": force_download,
+            "token": token,
+            "cache_dir": cache_dir,
+            "local_files_only": local_files_only,
+            "revision": revision,
+        }
+        require_policy_type(pretrained_name_or_path, cls.name, **hub)
+        weights = find_file(pretrained_name_or_path, SAFETENSORS_SINGLE_FILE, **hub)
+        if config is None:
+            config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, **hub)
+        device, config.device = config.device, "cpu"
+        with init_empty_weights(include_buffers=False):
+            policy = cls(config, **kwargs)
+        load_strictly(policy, weights)
+        config.device = device
+        policy.to(device)
+        policy.eval()
+        return policy
+
+    # --- training -------------------------------------------------------------------------------------------------
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
+        """Flow-matching loss of a training batch, over the action steps that are no padding.
+
+        reduction: "mean" for a scalar, "none" for (B,), as LeRobot's sample weighting wants it.
+        Returns the loss and a dict of numbers to log.
+        """
+        if reduction not in ("mean", "none"):
+            raise ValueError(f"reduction must be 'mean' or 'none', got {reduction!r}.")
+        device = self.training_step.device
+        images, img_masks = prepare_images(batch, self.config, device)
+        actions = pad_vector(batch[ACTION], self.config.max_action_dim).float()
+        draw = self._draw(batch, actions.shape)
+        embs, pad = self._geometry_tokens(batch)
+        if pad is not None and self.training:
+            pad = pad & (draw.dropout.to(device) >= self.config.geometry_dropout)[:, None]
+        losses = self.model(
+            images,
+            img_masks,
+            batch[OBS_LANGUAGE_TOKENS],
+            batch[OBS_LANGUAGE_ATTENTION_MASK],
+            actions,
+            draw.noise.to(device),
+            draw.time.to(device),
+            embs,
+            pad,
+        )
+        action_dim = self.config.action_feature.shape[0]
+        losses = losses[..., :action_dim]  # (B, S, action_dim)
+        is_pad = batch.get("action_is_pad")
+        valid = torch.ones(losses.shape[:2], device=device) if is_pad is None else (~is_pad).float()  # (B, S)
+        losses = losses * valid[..., None]
+        per_sample = losses.sum(dim=(1, 2)) / (valid.sum(dim=1) * action_dim)
+        mean = losses.sum() / (valid.sum() * action_dim)
+        info: dict[str, Any] = {"loss": mean.item()}
+        info["loss_per_dim"] = (losses.detach().sum(dim=(0, 1)) / valid.sum()).tolist()
+        gate = self.model.paligemma_with_expert.geometry_gate
+        if gate is not None:
+            info["gate_openness"] = gate.openness()
+        info.update({name: value.item() for name, value in self._last_update.items()})
+        return (per_sample if reduction == "none" else mean), info
+
+    def _draw(self, batch: dict[str, Tensor], shape: torch.Size) -> FlowDraw:
+        """Noise, flow time and dropout draw, keyed by (seed, step, dataset index); by the row where there is no index."""
+        index = batch.get("index")
+        indices = list(range(shape[0])) if index is None else [int(i) for i in index.flatten().tolist()]
+        return draw_flow(
+            self._noise_seed,
+            int(self.training_step) if self.training else _EVALUATION_STEP,
+            indices,
+            (shape[1], shape[2]),
+            alpha=self.config.time_sampling_beta_alpha,
+            beta=self.config.time_sampling_beta_beta,
+            scale=self.config.time_sampling_scale,
+            offset=self.config.time_sampling_offset,
+        )
+
+    def new_parameters(self) -> dict[str, nn.Parameter]:
+        """What π0.5 does not have: the adapter with its embeddings, and the gate."""
+        named = dict(self.named_parameters())
+        return {k: p for k, p in named.items() if k.startswith("geometry.") or ".geometry_gate." in k}
+
+    def get_optim_params(self) -> list[dict[str, Any]]:
+        """Two parameter groups: π0.5's, and the new parameters with their own rate, eps and no weight decay."""
+        new = [p for p in self.new_parameters().values() if p.requires_grad]
+        ids = {id(p) for p in new}
+        groups: list[dict[str, Any]] = [{"params": [p for p in self.parameters() if p.requires_grad and id(p) not in ids]}]
+        if new:
+            groups.append(
+                {"params": new, "lr": self.config.geometry_lr, "eps": self.config.geometry_eps, "weight_decay": 0.0}
+            )
+        return groups
+
+    @torch.no_grad()
+    def update(self) -> None:
+        """LeRobot calls this after every optimiser step: count it, and measure how far the new parameters moved."""
+        self.training_step += 1
+        now = [p.detach().clone() for p in self.new_parameters().values() if p.requires_grad]
+        before = getattr(self, "_previous", None)
+        self._previous = now
+        if before and len(before) == len(now):
+            moved = torch.stack([(a - b).square().sum() for a, b in zip(now, before, strict=True)]).sum()
+            size = torch.stack([b.square().sum() for b in before]).sum()
+            self._last_update = {"geometry_update": (moved / size.clamp_min(1e-12)).sqrt()}
+
+    # --- acting ---------------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Start of an episode: forget the queued actions."""
+        self._action_queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+        if self.geometry is not None:
+            self.geometry.reset()
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """One action (B, action_dim) per call; a new chunk is predicted when the queue is empty."""
+        if self.rtc_processor is not None and self.rtc_processor.rtc_config.enabled:
+            raise RuntimeError("Real-time chunking works on whole chunks: call predict_action_chunk, not select_action.")
+        self.eval()
+        if not self._action_queue:
+            chunk = self.predict_action_chunk(batch, **kwargs)[:, : self.config.n_action_steps]
+            self._action_queue.extend(chunk.transpose(0, 1))
+        return self._action_queue.popleft()
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """An action chunk (B, chunk_size, action_dim), normalised.
+
+        kwargs: `noise` (B, S, max_action_dim), `num_steps`, and real-time chunking's `inference_delay`,
+        `prev_chunk_left_over` and `execution_horizon`.
+        """
+        self.eval()
+        images, img_masks = prepare_images(batch, self.config, self.training_step.device)
+        embs, pad = self._geometry_tokens(batch)
+        actions = self.model.sample_actions(
+            images,
+            img_masks,
+            batch[OBS_LANGUAGE_TOKENS],
+            batch[OBS_LANGUAGE_ATTENTION_MASK],
+            geom_embs=embs,
+            geom_pad=pad,
+            **kwargs,
+        )
+        return actions[..., : self.config.action_feature.shape[0]]
+
+    def _geometry_tokens(self, batch: dict[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
+        return (None, None) if self.geometry is None else self.geometry(batch)
+
+    def supports_rtc(self) -> bool:
+        return True
+
+    def init_rtc_processor(self) -> None:
+        """LeRobot calls this after setting `config.rtc_config`."""
+        self.rtc_processor = None if self.config.rtc_config is None else RTCProcessor(self.config.rtc_config)
+        if hasattr(self, "model"):
+            self.model.rtc_processor = self.rtc_processor

@@ -1,0 +1,11 @@
+"""A simulated RGB-D robot: Meta-World tasks seen by a calibrated camera that stands elsewhere in every episode.
+
+```
+   cameras         where the camera may stand, and what MuJoCo's camera is in OpenCV terms
+   tasks           which tasks, in which ranges, in which words
+   environment     the gymnasium environment            configuration   its LeRobot registration, `metaworld_rgbd`
+   record          scripted experts -> LeRobotDataset
+```
+
+Nothing here is imported before it is needed: the package registers the environment without MuJoCo being installed.
+"""

@@ -1,0 +1,124 @@
+"""The gymnasium environment: a Meta-World task seen by one calibrated RGB-D camera."""
+
+import os
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # headless; must be set before MuJoCo is imported
+
+from typing import Any  # noqa: E402
+
+import gymnasium as gym  # noqa: E402
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+
+from .cameras import CAMERA_RANGES, extrinsics, intrinsics  # noqa: E402
+from .tasks import find_task, make_simulator  # noqa: E402
+
+CAMERA = "front"
+DEPTH_KEY = f"images.{CAMERA}_depth"
+EXTRINSICS_KEY = f"calibration.{CAMERA}.extrinsics"
+ACTION_REPEAT = 4  # simulator steps (1/80 s) per control step
+FPS = 20
+MAX_DEPTH_MM = 10_000  # beyond, a depth camera measures nothing: stored as 0
+STATE_NAMES = ["hand.x", "hand.y", "hand.z", "gripper"]
+ACTION_NAMES = ["hand.dx", "hand.dy", "hand.dz", "gripper"]
+_SLOW_RENDERING = (
+    mujoco.mjtRndFlag.mjRND_SHADOW,
+    mujoco.mjtRndFlag.mjRND_REFLECTION,
+    mujoco.mjtRndFlag.mjRND_SKYBOX,
+    mujoco.mjtRndFlag.mjRND_HAZE,
+)
+
+
+class RgbdMetaworldEnv(gym.Env):
+    """A task whose object and camera stand elsewhere in every episode, both drawn from the reset seed.
+
+    Observation: `pixels.front` (S, S, 3) uint8; `images.front_depth` (S, S, 1) float32 millimetres, 0 where nothing is
+    measured; `calibration.front.extrinsics` (4, 4) float32, base_T_camera; `agent_pos` (4,) hand position in metres and
+    gripper opening. Action (4,) in [-1, 1]: hand displacement and gripper effort. An episode ends with success.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    render_mode = "rgb_array"
+
+    def __init__(self, task: str, cameras: str = "train", image_size: int = 84, episode_length: int | None = None) -> None:
+        if cameras not in CAMERA_RANGES:
+            raise ValueError(f"There is no camera range '{cameras}'; choose one of: {', '.join(CAMERA_RANGES)}.")
+        spec = find_task(task)
+        self.task, self.task_description = task, spec.instruction
+        self._spec, self._range, self.image_size = spec, CAMERA_RANGES[cameras], image_size
+        self._max_episode_steps = episode_length or spec.max_steps
+        size = image_size
+        self.observation_space = gym.spaces.Dict(
+            {
+                "pixels": gym.spaces.Dict({CAMERA: gym.spaces.Box(0, 255, (size, size, 3), np.uint8)}),
+                "agent_pos": gym.spaces.Box(-np.inf, np.inf, (4,), np.float32),
+                DEPTH_KEY: gym.spaces.Box(0, np.inf, (size, size, 1), np.float32),
+                EXTRINSICS_KEY: gym.spaces.Box(-np.inf, np.inf, (4, 4), np.float32),
+            }
+        )
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self._simulator: Any = None  # built on first use, so that worker processes get a rendering context of their own
+
+    def _start(self) -> None:
+        self._simulator = make_simulator(self._spec)
+        model = self._simulator.model
+        model.vis.quality.offsamples = 0  # with multisampling off, software rendering is ten times as fast
+        self._renderer = mujoco.Renderer(model, self.image_size, self.image_size)
+        self.calibration = {CAMERA: intrinsics(model, self.image_size)}
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
+        super().reset(seed=seed)
+        if self._simulator is None:
+            self._start()
+        # Meta-World ignores `reset(seed=)`; its own `seed` decides where the object stands.
+        self._simulator.seed(int(self.np_random.integers(2**31)))
+        self._camera = self._range.draw(self.np_random)
+        self.simulator_state, _ = self._simulator.reset()
+        self._steps = 0
+        return self._observe(), {"is_success": False}
+
+    def step(self, action: np.ndarray) -> tuple[dict, float, bool, bool, dict]:
+        action = np.asarray(action, dtype=np.float32)
+        if action.shape != (4,) or not np.isfinite(action).all():
+            raise ValueError(f"An action must be 4 finite numbers, got {action}.")
+        action = action.clip(-1.0, 1.0)
+        reward, success = 0.0, False
+        for _ in range(ACTION_REPEAT):
+            self.simulator_state, step_reward, _, _, info = self._simulator.step(action)
+            reward += float(step_reward)
+            success = success or bool(info["success"])
+        self._steps += 1
+        truncated = not success and self._steps >= self._max_episode_steps
+        return self._observe(), reward, success, truncated, {"is_success": success}
+
+    def _observe(self) -> dict:
+        self._pixels, depth = self._render()
+        millimetres = np.rint(depth * 1000.0)
+        millimetres[millimetres > MAX_DEPTH_MM] = 0
+        return {
+            "pixels": {CAMERA: self._pixels},
+            "agent_pos": self.simulator_state[:4].astype(np.float32),
+            DEPTH_KEY: millimetres.astype(np.float32)[..., None],
+            EXTRINSICS_KEY: extrinsics(self._renderer.scene),
+        }
+
+    def _render(self) -> tuple[np.ndarray, np.ndarray]:
+        """RGB (S, S, 3) uint8 and depth (S, S) in metres along the optical axis."""
+        renderer, data = self._renderer, self._simulator.data
+        renderer.update_scene(data, self._camera)
+        for flag in _SLOW_RENDERING:
+            renderer.scene.flags[flag] = 0
+        pixels = renderer.render()
+        renderer.enable_depth_rendering()
+        depth = renderer.render()
+        renderer.disable_depth_rendering()
+        return pixels, depth
+
+    def render(self) -> np.ndarray:
+        """What the camera last saw, enlarged for videos."""
+        return self._pixels.repeat(4, axis=0).repeat(4, axis=1)
+
+    def close(self) -> None:
+        if self._simulator is not None:
+            self._renderer.close()
+            self._simulator = None
