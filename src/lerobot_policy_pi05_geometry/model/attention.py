@@ -37,18 +37,26 @@ class Attention(nn.Module):
         needs_grad = torch.is_grad_enabled() and q.requires_grad
         gate_needs_grad = torch.is_grad_enabled() and bias is not None and bias.requires_grad
         if gate_needs_grad or (needs_grad and q.device.type == "cpu"):
-            return torch.matmul(attention_weights(q, k, mask, bias), v.repeat_interleave(q.shape[1] // v.shape[1], 1))
-        attn_mask = mask[:, None]
-        if bias is not None:
-            attn_mask = bias[:, None].to(q.dtype).masked_fill(~attn_mask, float("-inf"))
-        return F.scaled_dot_product_attention(q, k, v, attn_mask=attn_mask, enable_gqa=q.shape[1] != k.shape[1])
+            weights = attention_weights(q, k, mask, bias)  # (B, H, Q, K)
+            return torch.matmul(_fold(weights, v), v).view_as(q)
+        return F.scaled_dot_product_attention(
+            q, k, v, attn_mask=_logit_bias(mask, bias, q.dtype), enable_gqa=q.shape[1] != k.shape[1]
+        )
 
 
 def attention_weights(q: Tensor, k: Tensor, mask: Tensor, bias: Tensor | None = None) -> Tensor:
     """The softmax of `Attention`, (B, H, Q, K) in q's dtype; shapes as there."""
-    k = k.repeat_interleave(q.shape[1] // k.shape[1], dim=1)
-    scores = torch.matmul(q, k.transpose(-1, -2)).float() * q.shape[-1] ** -0.5
-    if bias is not None:
-        scores = scores + bias[:, None]
-    scores = scores.masked_fill(~mask[:, None], float("-inf"))
+    scores = torch.matmul(_fold(q * q.shape[-1] ** -0.5, k), k.transpose(-1, -2)).float()
+    scores = scores.view(*q.shape[:3], k.shape[2]) + _logit_bias(mask, bias, torch.float32)
     return scores.softmax(dim=-1).to(q.dtype)
+
+
+def _fold(x: Tensor, shared: Tensor) -> Tensor:
+    """Queries of all heads that share a key head as rows of one matrix: (B, H, Q, ...) -> (B, KV, H / KV * Q, ...)."""
+    return x.reshape(x.shape[0], shared.shape[1], -1, x.shape[-1])
+
+
+def _logit_bias(mask: Tensor, bias: Tensor | None, dtype: torch.dtype) -> Tensor:
+    """What is added to the logits, (B, 1 or H, 1 or Q, K): 0 or the gate on visible keys, -inf on the others."""
+    hidden = torch.zeros(mask.shape, dtype=dtype, device=mask.device).masked_fill(~mask, float("-inf"))[:, None]
+    return hidden if bias is None else hidden + bias[:, None].to(dtype)

@@ -48,7 +48,7 @@ PALIGEMMA_VARIANTS = {
         vocab_size=257_152,
     ),
     "small": PaliGemmaVariant(
-        gemma=GemmaVariant(width=128, depth=4, mlp_dim=384, num_heads=8, num_kv_heads=1, head_dim=32),
+        gemma=GemmaVariant(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
         vision=VisionVariant(width=128, depth=3, mlp_dim=256, num_heads=4, patch_size=14),
         vocab_size=1024,
     ),
@@ -63,6 +63,6 @@ EXPERT_VARIANTS = {
     "gemma_300m": GemmaVariant(
         width=1024, depth=18, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=256
     ),
-    "small": GemmaVariant(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=32),
+    "small": GemmaVariant(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
     "tiny": GemmaVariant(width=24, depth=3, mlp_dim=48, num_heads=8, num_kv_heads=1, head_dim=8),
 }
