@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 from huggingface_hub import hf_hub_download
-from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from huggingface_hub.errors import EntryNotFoundError
 from safetensors import SafetensorError, safe_open
 from torch import nn
@@ -20,7 +19,9 @@ def find_file(model_id: str | Path, name: str, **hub: Any) -> Path:
     folder = Path(model_id)
     if folder.is_dir():
         if not (folder / name).is_file():
-            raise FileNotFoundError(f"Checkpoint {folder} has no {name}; give the folder that holds it (pretrained_model).")
+            raise FileNotFoundError(
+                f"Checkpoint {folder} has no {name}; give the folder that holds it (pretrained_model)."
+            )
         return folder / name
     if folder.is_absolute() or str(model_id).startswith("."):
         raise FileNotFoundError(f"Checkpoint folder {folder} is not there.")

@@ -63,13 +63,16 @@ class PI05GeometryConfig(PreTrainedConfig):
     max_depth: float = 10.0  # metres; farther counts as not measured
     calibration_path: str | None = None  # JSON file; None: calibration.json in the dataset's meta folder
     calibration: dict[str, CameraCalibration] = field(default_factory=dict)  # what was read from it
-    geometry_features: dict[str, PolicyFeature] = field(default_factory=dict)  # depth and poses, set by validate_features
+    geometry_features: dict[str, PolicyFeature] = field(
+        default_factory=dict
+    )  # depth and poses, set by validate_features
 
     # Tokenizer folder or hub id; None: PaliGemma's from the hub, or the built-in one for the small sizes.
     tokenizer_path: str | None = None
     tokenizer_max_length: int = 200
 
     num_inference_steps: int = 10
+    flow_samples: int = 1  # noises and flow times per training sample; they share one pass over prefix and geometry
     time_sampling_beta_alpha: float = 1.5
     time_sampling_beta_beta: float = 1.0
     time_sampling_scale: float = 0.999
@@ -127,10 +130,19 @@ class PI05GeometryConfig(PreTrainedConfig):
             raise ValueError(f"geometry_grid must be at least 1, got {self.geometry_grid}.")
         if not 0 <= self.geometry_dropout < 1:
             raise ValueError(f"geometry_dropout must be in [0, 1), got {self.geometry_dropout}.")
+        if self.flow_samples < 1:
+            raise ValueError(f"flow_samples must be at least 1, got {self.flow_samples}.")
+        if self.flow_samples > 1 and self.geometry_time == "denoise" and self.geometry_source != "none":
+            raise ValueError(
+                "flow_samples above 1 share one geometry segment, which geometry_time=denoise ties to a single flow time; "
+                "use geometry_time=clean."
+            )
         if self.max_depth <= 0:
             raise ValueError(f"max_depth must be above 0 m, got {self.max_depth}.")
         if self.param_dtype == "bfloat16" and self.dtype == "float32":
-            raise ValueError("param_dtype=bfloat16 needs dtype=bfloat16: float32 products of bf16 weights gain nothing.")
+            raise ValueError(
+                "param_dtype=bfloat16 needs dtype=bfloat16: float32 products of bf16 weights gain nothing."
+            )
         if self.image_resolution[0] != self.image_resolution[1]:
             raise ValueError(f"image_resolution must be square, got {tuple(self.image_resolution)}.")
 

@@ -79,7 +79,9 @@ def check_stats(config: PI05GeometryConfig, stats: Mapping[str, Mapping[str, Any
         for dim in (high <= low).nonzero().flatten().tolist():
             values = [torch.as_tensor(stats[key][n]).flatten()[dim].item() for n in ("min", "max") if n in stats[key]]
             if len(values) == 2 and values[0] == values[1]:
-                logger.warning("%s[%d] is constant (%g) in the dataset; it carries no information.", key, dim, values[0])
+                logger.warning(
+                    "%s[%d] is constant (%g) in the dataset; it carries no information.", key, dim, values[0]
+                )
                 continue
             raise ValueError(
                 f"{key}[{dim}] has {low_name} = {high_name} = {low[dim].item():g} although it is not constant, so its "

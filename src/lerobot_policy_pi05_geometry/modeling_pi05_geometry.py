@@ -100,7 +100,9 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def _set_trainable(self) -> None:
         network = self.model.paligemma_with_expert
         network.set_trainable(self.config.train_expert_only, self.config.freeze_vision_encoder)
-        if not self.config.image_features:  # a policy without RGB runs no vision tower, so it must not wait for its gradient
+        if (
+            not self.config.image_features
+        ):  # a policy without RGB runs no vision tower, so it must not wait for its gradient
             network.paligemma.model.vision_tower.requires_grad_(False)
             network.paligemma.model.multi_modal_projector.requires_grad_(False)
 
@@ -173,7 +175,9 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             pad,
         )
         action_dim = self.config.action_feature.shape[0]
-        losses = losses[..., :action_dim]  # (B, S, action_dim)
+        losses = losses[..., :action_dim]  # (B, S, action_dim), with K before S for several flow samples
+        if losses.ndim == 4:
+            losses = losses.mean(dim=1)
         is_pad = batch.get("action_is_pad")
         valid = torch.ones(losses.shape[:2], device=device) if is_pad is None else (~is_pad).float()  # (B, S)
         losses = losses * valid[..., None]
@@ -195,11 +199,12 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             self._noise_seed,
             int(self.training_step) if self.training else _EVALUATION_STEP,
             indices,
-            (shape[1], shape[2]),
+            (shape[1], shape[2]),  # (S, D)
             alpha=self.config.time_sampling_beta_alpha,
             beta=self.config.time_sampling_beta_beta,
             scale=self.config.time_sampling_scale,
             offset=self.config.time_sampling_offset,
+            samples=self.config.flow_samples,
         )
 
     def new_parameters(self) -> dict[str, nn.Parameter]:
@@ -211,7 +216,9 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         """Two parameter groups: π0.5's, and the new parameters with their own rate, eps and no weight decay."""
         new = [p for p in self.new_parameters().values() if p.requires_grad]
         ids = {id(p) for p in new}
-        groups: list[dict[str, Any]] = [{"params": [p for p in self.parameters() if p.requires_grad and id(p) not in ids]}]
+        groups: list[dict[str, Any]] = [
+            {"params": [p for p in self.parameters() if p.requires_grad and id(p) not in ids]}
+        ]
         if new:
             groups.append(
                 {"params": new, "lr": self.config.geometry_lr, "eps": self.config.geometry_eps, "weight_decay": 0.0}
@@ -242,7 +249,9 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """One action (B, action_dim) per call; a new chunk is predicted when the queue is empty."""
         if self.rtc_processor is not None and self.rtc_processor.rtc_config.enabled:
-            raise RuntimeError("Real-time chunking works on whole chunks: call predict_action_chunk, not select_action.")
+            raise RuntimeError(
+                "Real-time chunking works on whole chunks: call predict_action_chunk, not select_action."
+            )
         self.eval()
         if not self._action_queue:
             chunk = self.predict_action_chunk(batch, **kwargs)[:, : self.config.n_action_steps]

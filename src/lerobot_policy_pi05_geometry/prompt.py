@@ -117,7 +117,9 @@ class PortableTokenizerProcessorStep(TokenizerProcessorStep):
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         if set(state) != set(_FILES):
-            raise ValueError(f"A saved tokenizer has the files {', '.join(_FILES)}, this one has {', '.join(sorted(state))}.")
+            raise ValueError(
+                f"A saved tokenizer has the files {', '.join(_FILES)}, this one has {', '.join(sorted(state))}."
+            )
         self._files = {name: tensor.cpu().numpy().tobytes() for name, tensor in state.items()}
         self._built = None
 
@@ -125,12 +127,14 @@ class PortableTokenizerProcessorStep(TokenizerProcessorStep):
 def read_tokenizer_files(name: str) -> dict[str, bytes]:
     """`tokenizer.json` and `tokenizer_config.json` of a local folder, a hub id, or the built-in tokenizer."""
     if name == SMALL_TOKENIZER:
-        tokenizer = build_small_tokenizer()
+        tokenizer: Any = build_small_tokenizer()
     else:
         local = Path(name).expanduser()
         looks_local = name.startswith((".", "/", "~")) or name.count("/") != 1
         if looks_local and not local.is_dir():
-            raise FileNotFoundError(f"Tokenizer folder {name} is not there; set --policy.tokenizer_path to an existing one.")
+            raise FileNotFoundError(
+                f"Tokenizer folder {name} is not there; set --policy.tokenizer_path to an existing one."
+            )
         try:
             tokenizer = AutoTokenizer.from_pretrained(local if local.is_dir() else name)
         except (OSError, ValueError) as error:
@@ -158,7 +162,9 @@ def build_small_tokenizer() -> PreTrainedTokenizerFast:
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     tokenizer.decoder = decoders.ByteLevel()
-    corpus = [f"Task: {word} {word}, State: {n % 256} {n % 256};\nAction: " for n, word in enumerate(_WORDS.split() * 8)]
+    corpus = [
+        f"Task: {word} {word}, State: {n % 256} {n % 256};\nAction: " for n, word in enumerate(_WORDS.split() * 8)
+    ]
     corpus += [" ".join(str(n) for n in range(STATE_BINS))] * 8
     trainer = trainers.BpeTrainer(
         vocab_size=1024,

@@ -21,12 +21,18 @@ def read_calibration_file(path: str | Path) -> dict[str, CameraCalibration]:
     """Read and check a calibration file. Raises FileNotFoundError or ValueError with one sentence that says what is off."""
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"Calibration file {path} is not there; set --policy.calibration_path to an existing file.")
+        raise FileNotFoundError(
+            f"Calibration file {path} is not there; set --policy.calibration_path to an existing file."
+        )
     try:
         content = json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise ValueError(f"Calibration file {path} is no JSON: {error}.") from error
-    if not isinstance(content, dict) or set(content) != {"frame", "cameras"} or not isinstance(content["cameras"], dict):
+    if (
+        not isinstance(content, dict)
+        or set(content) != {"frame", "cameras"}
+        or not isinstance(content["cameras"], dict)
+    ):
         raise ValueError(f"Calibration file {path} must be an object with the entries 'frame' and 'cameras'.")
     if content["frame"] != "base":
         raise ValueError(
@@ -35,7 +41,9 @@ def read_calibration_file(path: str | Path) -> dict[str, CameraCalibration]:
     cameras = {}
     for name, entry in content["cameras"].items():
         if not isinstance(entry, dict) or not {"intrinsics", "size"} <= set(entry) <= _CAMERA_FIELDS:
-            raise ValueError(f"Camera '{name}' in {path} needs the entries 'intrinsics', 'size' and 'extrinsics' (may be null).")
+            raise ValueError(
+                f"Camera '{name}' in {path} needs the entries 'intrinsics', 'size' and 'extrinsics' (may be null)."
+            )
         try:
             extrinsics = entry.get("extrinsics")
             camera = CameraCalibration(

@@ -27,10 +27,14 @@ class CameraCalibration:
     def check(self, name: str) -> None:
         """Raise ValueError, naming the camera, unless this is a usable calibration."""
         if len(self.intrinsics) != 4 or not all(math.isfinite(v) for v in self.intrinsics):
-            raise ValueError(f"Intrinsics of camera '{name}' must be four finite numbers fx, fy, cx, cy; got {self.intrinsics}.")
+            raise ValueError(
+                f"Intrinsics of camera '{name}' must be four finite numbers fx, fy, cx, cy; got {self.intrinsics}."
+            )
         fx, fy = self.intrinsics[:2]
         if fx <= 0 or fy <= 0:
-            raise ValueError(f"Intrinsics of camera '{name}' are singular: fx and fy must be above 0, got {fx} and {fy}.")
+            raise ValueError(
+                f"Intrinsics of camera '{name}' are singular: fx and fy must be above 0, got {fx} and {fy}."
+            )
         if len(self.size) != 2 or min(self.size) < 1:
             raise ValueError(f"Size of camera '{name}' must be [width, height] in pixels, got {self.size}.")
         if self.extrinsics is not None:

@@ -20,8 +20,8 @@ _MASK = (1 << 64) - 1
 class FlowDraw(NamedTuple):
     """What is random about a training batch, on the CPU."""
 
-    noise: Tensor  # (B, S, D) float32, standard normal
-    time: Tensor  # (B,) float32 in (0, 1]
+    noise: Tensor  # (B, S, D) float32, standard normal; (B, K, S, D) for K > 1 flow samples
+    time: Tensor  # (B,) float32 in (0, 1]; (B, K)
     dropout: Tensor  # (B,) float32, uniform in [0, 1)
 
 
@@ -35,22 +35,22 @@ def draw_flow(
     beta: float,
     scale: float,
     offset: float,
+    samples: int = 1,
 ) -> FlowDraw:
     """Draw noise, flow time Beta(alpha, beta) * scale + offset, and a uniform number for each dataset index.
 
     seed: of the run. step: optimiser steps done so far. indices: dataset index of each of the B samples.
-    shape: (S, D) of one action chunk. Returns a `FlowDraw`.
+    shape: (S, D) of one action chunk. samples: K, noises and times per observation. Returns a `FlowDraw`.
     """
     noise, time, dropout = [], [], []
     for index in indices:
         generator = np.random.Generator(
             np.random.Philox(key=[seed & _MASK, index & _MASK], counter=[0, 0, 0, step & _MASK])
         )
-        noise.append(generator.standard_normal(shape, dtype=np.float32))
-        time.append(generator.beta(alpha, beta) * scale + offset)
+        noise.append(generator.standard_normal((samples, *shape), dtype=np.float32))
+        time.append(generator.beta(alpha, beta, samples) * scale + offset)
         dropout.append(generator.random())
-    return FlowDraw(
-        torch.from_numpy(np.stack(noise)),
-        torch.tensor(time, dtype=torch.float32),
-        torch.tensor(dropout, dtype=torch.float32),
-    )
+    noises, times = torch.from_numpy(np.stack(noise)), torch.from_numpy(np.stack(time)).float()
+    if samples == 1:
+        noises, times = noises[:, 0], times[:, 0]
+    return FlowDraw(noises, times, torch.tensor(dropout, dtype=torch.float32))

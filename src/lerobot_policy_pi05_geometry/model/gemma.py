@@ -50,10 +50,18 @@ class AdaRMSNorm(nn.Module):
         nn.init.zeros_(self.dense.weight)
 
     def forward(self, x: Tensor, cond: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """x (B, N, W), cond (B or 1, cond_dim) float32 -> (B, N, W) and the gate (B or 1, 1, W), both in x's dtype."""
+        """Modulate x (B, N, W) by cond, (B or 1, cond_dim) float32, or (B, K, cond_dim) for K samples of N / K tokens.
+
+        Returns (B, N, W) and the residual gate, (B or 1, 1, W) or (B, N, W), both in x's dtype.
+        """
         if cond is None:
             raise ValueError("An adaptive norm needs `adarms_cond`, the embedded flow time of its segment.")
-        scale, shift, gate = self.dense(cond)[:, None].chunk(3, dim=-1)
+        modulation = self.dense(cond)
+        if cond.ndim == 3:
+            modulation = modulation.repeat_interleave(x.shape[1] // cond.shape[1], dim=1)
+        else:
+            modulation = modulation[:, None]
+        scale, shift, gate = modulation.chunk(3, dim=-1)
         return (_normalise(x) * (1.0 + scale) + shift).to(x.dtype), gate.to(x.dtype)
 
 
@@ -121,7 +129,7 @@ class GemmaLayer(nn.Module):
     ) -> tuple[Tensor | None, KeysValues]:
         """Run the segment through the layer.
 
-        x (B, N, W); rotary cos and sin (B, N, D/2); mask (B, 1 or N, K) bool; cond (B or 1, cond_dim) float32;
+        x (B, N, W); rotary cos and sin (B, N, D/2); mask (B, 1 or N, K) bool; cond as in `AdaRMSNorm`;
         bias (H, K) float32; earlier: keys and values of the earlier segments, where there is no cache; slot: the
         segment's place in the cache; output=False stops after the keys and values, which is all that the last layer
         of prefix and geometry is needed for.
@@ -180,14 +188,20 @@ class GemmaModel(nn.Module):
         These weights load and save like any other; without a gradient they would fail DDP.
         """
         last = self.layers[-1]
-        for module in (last.self_attn.q_proj, last.self_attn.o_proj, last.mlp, last.post_attention_layernorm, self.norm):
+        for module in (
+            last.self_attn.q_proj,
+            last.self_attn.o_proj,
+            last.mlp,
+            last.post_attention_layernorm,
+            self.norm,
+        ):
             module.requires_grad_(False)
 
 
 def _init_weights(module: nn.Module) -> None:
-    """Gemma's initialisation, normal(0.02); norms start at zero, so that adaRMS starts as the identity."""
+    """Normal with variance 1 / width, Gemma's 0.02 at full size; norms start at zero, so that adaRMS is the identity."""
     if isinstance(module, nn.Embedding) or (isinstance(module, nn.Linear) and not isinstance(module, Float32Linear)):
-        nn.init.normal_(module.weight, std=0.02)
+        nn.init.normal_(module.weight, std=module.weight.shape[1] ** -0.5)
     elif isinstance(module, AdaRMSNorm):
         nn.init.zeros_(module.dense.weight)
         nn.init.zeros_(module.dense.bias)

@@ -61,15 +61,19 @@ def make_att_mask(pad_masks: Tensor, att_masks: AttMasks) -> Tensor:
     return visible[None] & pad_masks[:, None, :]
 
 
-def segment_mask(segment: Segment, pads: Sequence[Tensor | None], atts: Sequence[AttMasks | None]) -> Tensor:
+def segment_mask(
+    segment: Segment, pads: Sequence[Tensor | None], atts: Sequence[AttMasks | None], samples: int = 1
+) -> Tensor:
     """Attention mask of one segment's queries against the keys of all segments up to its own.
 
     pads, atts: per segment, (B, N_i) bool and N_i entries; None for an absent segment.
+    samples: flow samples that stand side by side in the segment, blind to each other (training's suffix only).
     Returns (B, 1, K) bool where every query of the segment sees the same keys, else (B, Q, K).
     """
     present = [s for s in Segment if s <= segment and pads[s] is not None]
-    keys = torch.cat([pads[s] for s in present], dim=1)  # (B, K)
-    lengths = [pads[s].shape[1] for s in present]  # type: ignore[union-attr]
+    seen = [pad for pad in pads[: segment + 1] if pad is not None]
+    keys = torch.cat(seen, dim=1)  # (B, K)
+    lengths = [pad.shape[1] for pad in seen]
     flat = [int(entry) for s in present for entry in (atts[s] or [])]
     if len(flat) != sum(lengths):
         raise ValueError(f"att_masks need one entry per token: {sum(lengths)} tokens, {len(flat)} entries.")
@@ -81,19 +85,24 @@ def segment_mask(segment: Segment, pads: Sequence[Tensor | None], atts: Sequence
             "block before it, which then sees it too."
         )
     own = blocks[start:]
-    if not own or own[0] == own[-1]:
+    if own and own[0] != own[-1]:
+        return make_att_mask(keys, flat)[:, start:]
+    if samples == 1:
         return keys[:, None, :]
-    return make_att_mask(keys, flat)[:, start:]
+    sample = torch.arange(lengths[-1], device=keys.device) // (lengths[-1] // samples)  # (N,)
+    earlier = torch.ones(lengths[-1], start, dtype=torch.bool, device=keys.device)
+    return keys[:, None, :] & torch.cat([earlier, sample[:, None] == sample[None]], dim=1)
 
 
-def segment_positions(pads: Sequence[Tensor | None], rule: GeometryPositions) -> list[Tensor | None]:
+def segment_positions(pads: Sequence[Tensor | None], rule: GeometryPositions, samples: int = 1) -> list[Tensor | None]:
     """Rotary positions of each segment.
 
     sequential: cumsum over P|G|S - 1, so geometry moves the suffix, and so does a hole in it.
     parallel: the suffix counts P|S, as if geometry were not there; cell i stands at the first position after the
         prefix plus i, whether or not the cells before it are holes.
 
-    pads: per segment (B, N_i) bool or None. Returns per segment (B, N_i) int64 or None.
+    pads: per segment (B, N_i) bool or None. samples: flow samples in the suffix, which all stand at the same positions.
+    Returns per segment (B, N_i) int64 or None.
     """
     prefix, geometry, suffix = pads
     after: Tensor | int = 0  # position of the next real token, (B, 1)
@@ -103,12 +112,12 @@ def segment_positions(pads: Sequence[Tensor | None], rule: GeometryPositions) ->
         after = prefix.sum(dim=1, keepdim=True)
     if geometry is not None:
         if rule == "parallel":
-            positions[Segment.GEOMETRY] = after + torch.arange(
-                geometry.shape[1], device=geometry.device
-            ).expand_as(geometry)
+            positions[Segment.GEOMETRY] = after + torch.arange(geometry.shape[1], device=geometry.device).expand_as(
+                geometry
+            )
         else:
             positions[Segment.GEOMETRY] = after + geometry.cumsum(dim=1) - 1
             after = after + geometry.sum(dim=1, keepdim=True)
     if suffix is not None:
-        positions[Segment.SUFFIX] = after + suffix.cumsum(dim=1) - 1
+        positions[Segment.SUFFIX] = after + (suffix.unflatten(1, (samples, -1)).cumsum(dim=2) - 1).flatten(1)
     return positions

@@ -12,8 +12,10 @@ denoising step gives only the suffix and reads the rest from the cache. All thre
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
+from transformers import SiglipVisionModel
 
 from .attention import rotary_table
 from .cache import SegmentKVCache
@@ -28,6 +30,10 @@ from .vision import Projector, build_vision_tower, embed_images
 class PaliGemmaModel(nn.Module):
     """Vision tower, projector and language model, under LeRobot's names."""
 
+    language_model: GemmaModel
+    vision_tower: SiglipVisionModel
+    multi_modal_projector: Projector
+
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         variant = config.paligemma
@@ -36,10 +42,12 @@ class PaliGemmaModel(nn.Module):
         self.language_model = GemmaModel(variant.gemma, vocab_size=variant.vocab_size)
 
 
-class Holder(nn.Module):
+class Holder[T: nn.Module](nn.Module):
     """Gives its content the name `model`, as the released checkpoints have it."""
 
-    def __init__(self, model: nn.Module) -> None:
+    model: T
+
+    def __init__(self, model: T) -> None:
         super().__init__()
         self.model = model
 
@@ -104,12 +112,10 @@ class PaliGemmaWithExpert(nn.Module):
         """Token ids (B, L) -> (B, L, W_vlm)."""
         return self.language_model.embed(tokens)
 
-    def make_cache(self, batch: int, lengths: Sequence[int], like: Tensor) -> SegmentKVCache:
-        """An empty cache for segments of these lengths, on the device of `like`, in the compute dtype."""
+    def make_cache(self, batch: int, lengths: Sequence[int], device: torch.device) -> SegmentKVCache:
+        """An empty cache for segments of these lengths, in the compute dtype."""
         expert = self.config.expert
-        return SegmentKVCache(
-            expert.depth, batch, expert.num_kv_heads, expert.head_dim, lengths, self.dtype, like.device
-        )
+        return SegmentKVCache(expert.depth, batch, expert.num_kv_heads, expert.head_dim, lengths, self.dtype, device)
 
     def forward(
         self,

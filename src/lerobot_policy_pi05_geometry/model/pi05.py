@@ -108,18 +108,29 @@ class PI05Pytorch(nn.Module):
         geom_pad: Tensor | None = None,
         geom_att: AttMasks | None = None,
     ) -> Tensor:
-        """Flow-matching loss of every action entry, unreduced, (B, S, D) float32.
+        """Flow-matching loss of every action entry, unreduced, in the shape of `noise`, float32.
 
-        actions, noise: (B, S, D). time: (B,). geom_embs: (B, G, W) tokens of the geometry adapter, geom_pad: (B, G)
-        bool, False for a hole, geom_att: G entries, one block by default. The rest as in `embed_prefix`.
+        actions: (B, S, D). noise: (B, S, D) and time: (B,), or (B, K, S, D) and (B, K): K flow samples of the same
+        observation share one pass over prefix and geometry, blind to each other and all at the same positions.
+        geom_embs: (B, G, W) tokens of the geometry adapter, geom_pad: (B, G) bool, False for a hole, geom_att: G
+        entries, one block by default. The rest as in `embed_prefix`.
         """
-        t = time[:, None, None]
+        samples = noise.shape[1] if noise.ndim == 4 else 1
+        if samples > 1 and self._geometry_follows_time:
+            raise ValueError(
+                "Several flow samples share one geometry segment, so geometry_time='denoise' has no one time."
+            )
+        t = time[..., None, None]
+        clean = actions if noise.ndim == 3 else actions[:, None]
         with compute_in(self.config.dtype, tokens.device):
             prefix, geometry = self._context(images, img_masks, tokens, masks, geom_embs, geom_pad, geom_att)
-            embs, pad, att, cond = self.embed_suffix(t * noise + (1 - t) * actions, time)
-            output, _ = self._run([prefix, geometry, SegmentTokens(embs, pad, att)], cond)
-            velocity = self.action_out_proj(output)
-        return F.mse_loss(velocity, noise - actions, reduction="none")
+            x_t = t * noise + (1 - t) * clean
+            embs, pad, att, cond = self.embed_suffix(x_t.flatten(1, -2), time.flatten())
+            if noise.ndim == 4:
+                cond = cond.unflatten(0, time.shape)  # (B, K, W)
+            output, _ = self._run([prefix, geometry, SegmentTokens(embs, pad, att)], cond, samples=samples)
+            velocity = self.action_out_proj(output).view_as(noise)
+        return F.mse_loss(velocity, noise - clean, reduction="none")
 
     @torch.no_grad()
     def sample_actions(
@@ -216,12 +227,17 @@ class PI05Pytorch(nn.Module):
         if geom_embs is None:
             return prefix, None
         if self.config.geometry is None:
-            raise ValueError("This network was built without geometry (`geometry_source=none`); it cannot use geom_embs.")
+            raise ValueError(
+                "This network was built without geometry (`geometry_source=none`); it cannot use geom_embs."
+            )
         if geom_embs.shape[-1] != self.geometry_width:
             raise ValueError(f"geom_embs need width {self.geometry_width}, got {geom_embs.shape[-1]}.")
-        pad = torch.ones(geom_embs.shape[:2], dtype=torch.bool, device=geom_embs.device) if geom_pad is None else geom_pad
+        pad = (
+            torch.ones(geom_embs.shape[:2], dtype=torch.bool, device=geom_embs.device) if geom_pad is None else geom_pad
+        )
         embs = _silence(geom_embs, pad)
         if self.config.geometry.placement == "prefix":
+            assert prefix.embs is not None
             joined = torch.cat([prefix.embs, embs.to(prefix.embs.dtype)], dim=1)
             return SegmentTokens(joined, torch.cat([prefix.pad, pad], dim=1), [0] * joined.shape[1]), None
         return prefix, SegmentTokens(embs, pad, one_block(embs.shape[1]) if geom_att is None else geom_att)
@@ -229,7 +245,7 @@ class PI05Pytorch(nn.Module):
     def _prefill(self, prefix: SegmentTokens, geometry: SegmentTokens | None, suffix_length: int) -> SegmentKVCache:
         """Run prefix and (clean) geometry once and keep their keys and values."""
         lengths = [prefix.pad.shape[1], 0 if geometry is None else geometry.pad.shape[1], suffix_length]
-        cache = self.paligemma_with_expert.make_cache(prefix.pad.shape[0], lengths, prefix.embs)
+        cache = self.paligemma_with_expert.make_cache(prefix.pad.shape[0], lengths, prefix.pad.device)
         self._run([prefix, geometry, None], None, cache, [True, not self._geometry_follows_time, False])
         return cache
 
@@ -239,15 +255,19 @@ class PI05Pytorch(nn.Module):
         suffix_cond: Tensor | None,
         cache: SegmentKVCache | None = None,
         given: Sequence[bool] = (True, True, True),
+        samples: int = 1,
     ) -> tuple[Tensor | None, SegmentKVCache | None]:
         """Run the given ones of these segments; the others are in the cache. Returns the suffix's output (B, S, W)."""
         pads = [None if s is None else s.pad for s in segments]
         atts = [None if s is None else s.att for s in segments]
         inputs = [s if keep else None for s, keep in zip(segments, given, strict=True)]
         geometry = self.config.geometry
-        positions = segment_positions(pads, geometry.positions if geometry else "sequential")
+        positions = segment_positions(pads, geometry.positions if geometry else "sequential", samples)
         outputs, cache = self.paligemma_with_expert(
-            attention_mask=[None if inputs[s] is None else segment_mask(s, pads, atts) for s in Segment],
+            attention_mask=[
+                None if inputs[s] is None else segment_mask(s, pads, atts, samples if s is Segment.SUFFIX else 1)
+                for s in Segment
+            ],
             position_ids=positions,
             past_key_values=cache,
             inputs_embeds=[None if s is None else s.embs for s in inputs],

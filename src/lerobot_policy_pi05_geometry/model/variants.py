@@ -60,9 +60,7 @@ PALIGEMMA_VARIANTS = {
 }
 
 EXPERT_VARIANTS = {
-    "gemma_300m": GemmaVariant(
-        width=1024, depth=18, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=256
-    ),
+    "gemma_300m": GemmaVariant(width=1024, depth=18, mlp_dim=4096, num_heads=8, num_kv_heads=1, head_dim=256),
     "small": GemmaVariant(width=128, depth=4, mlp_dim=256, num_heads=8, num_kv_heads=1, head_dim=16),
     "tiny": GemmaVariant(width=24, depth=3, mlp_dim=48, num_heads=8, num_kv_heads=1, head_dim=8),
 }

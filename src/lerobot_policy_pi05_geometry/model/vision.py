@@ -22,7 +22,7 @@ def build_vision_tower(variant: PaliGemmaVariant, image_size: int) -> SiglipVisi
     """A SigLIP tower without its pooling head, as PaliGemma uses it."""
     vision = variant.vision
     return SiglipVisionModel(
-        SiglipVisionConfig(
+        SiglipVisionConfig(  # type: ignore[call-arg]
             hidden_size=vision.width,
             intermediate_size=vision.mlp_dim,
             num_hidden_layers=vision.depth,

@@ -4,7 +4,7 @@
    cameras         where the camera may stand, and what MuJoCo's camera is in OpenCV terms
    tasks           which tasks, in which ranges, in which words
    environment     the gymnasium environment            configuration   its LeRobot registration, `metaworld_rgbd`
-   record          scripted experts -> LeRobotDataset
+   record          scripted experts -> LeRobotDataset       evaluate        a checkpoint on seeds it never saw
 ```
 
 Nothing here is imported before it is needed: the package registers the environment without MuJoCo being installed.

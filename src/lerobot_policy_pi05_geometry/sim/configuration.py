@@ -64,7 +64,9 @@ class MetaworldRgbdEnv(EnvConfig):
         make = freeze_after_episode_end(partial(RgbdMetaworldEnv, **self.gym_kwargs))
         mode = gym.vector.AutoresetMode.NEXT_STEP
         if use_async_envs and n_envs > 1:
-            vector: gym.vector.VectorEnv = gym.vector.AsyncVectorEnv([make] * n_envs, context="spawn", autoreset_mode=mode)
+            vector: gym.vector.VectorEnv = gym.vector.AsyncVectorEnv(
+                [make] * n_envs, context="spawn", autoreset_mode=mode
+            )
         else:
             vector = gym.vector.SyncVectorEnv([make] * n_envs, autoreset_mode=mode)
         return {self.type: {0: vector}}

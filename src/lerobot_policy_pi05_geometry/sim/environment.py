@@ -4,14 +4,14 @@ import os
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # headless; must be set before MuJoCo is imported
 
-from typing import Any  # noqa: E402
+from typing import Any, ClassVar
 
-import gymnasium as gym  # noqa: E402
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
+import gymnasium as gym
+import mujoco
+import numpy as np
 
-from .cameras import CAMERA_RANGES, extrinsics, intrinsics  # noqa: E402
-from .tasks import find_task, make_simulator  # noqa: E402
+from .cameras import CAMERA_RANGES, extrinsics, intrinsics
+from .tasks import find_task, make_simulator
 
 CAMERA = "front"
 DEPTH_KEY = f"images.{CAMERA}_depth"
@@ -37,10 +37,12 @@ class RgbdMetaworldEnv(gym.Env):
     gripper opening. Action (4,) in [-1, 1]: hand displacement and gripper effort. An episode ends with success.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    metadata: ClassVar[dict] = {"render_modes": ["rgb_array"], "render_fps": FPS}
     render_mode = "rgb_array"
 
-    def __init__(self, task: str, cameras: str = "train", image_size: int = 84, episode_length: int | None = None) -> None:
+    def __init__(
+        self, task: str, cameras: str = "train", image_size: int = 84, episode_length: int | None = None
+    ) -> None:
         if cameras not in CAMERA_RANGES:
             raise ValueError(f"There is no camera range '{cameras}'; choose one of: {', '.join(CAMERA_RANGES)}.")
         spec = find_task(task)

@@ -1,0 +1,54 @@
+"""The same pictures for any checkpoint and dataset."""
+
+from pathlib import Path
+
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies import make_policy, make_pre_post_processors
+
+from ..modeling_pi05_geometry import PI05GeometryPolicy
+from .page import Page, picture
+from .pictures import depth_figure, layout_figure, segment_share_figure
+
+
+def write_inspection(checkpoint: str, root: Path, repo_id: str, frame: int, device: str, output: Path) -> None:
+    """Write a page about one frame of a dataset, seen by a checkpoint.
+
+    Raises ValueError for a frame that is not there or a checkpoint of another policy.
+    """
+    if not (root / "meta" / "info.json").is_file():
+        raise FileNotFoundError(
+            f"{root} is no LeRobotDataset: it has no meta/info.json; give --dataset.root its folder."
+        )
+    dataset = LeRobotDataset(repo_id, root=root)
+    if not 0 <= frame < len(dataset):
+        raise ValueError(f"The dataset has frames 0 to {len(dataset) - 1}, there is no frame {frame}.")
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.pretrained_path = Path(checkpoint)
+    config.device = device
+    policy = make_policy(config, ds_meta=dataset.meta)
+    if not isinstance(policy, PI05GeometryPolicy):
+        raise ValueError(
+            f"{checkpoint} is a checkpoint of policy type '{config.type}'; this looks into 'pi05_geometry' ones."
+        )
+    preprocess, _ = make_pre_post_processors(
+        policy_cfg=config, pretrained_path=checkpoint, preprocessor_overrides={"device_processor": {"device": device}}
+    )
+    batch = preprocess(frame_batch(dataset, frame))
+    page = Page(f"{Path(checkpoint).name} on frame {frame} of {root.name}")
+    page.lead(f"Task: {dataset[frame]['task']}")
+    if policy.geometry is not None and policy.config.geometry_source == "rgbd":
+        page.row(picture(depth_figure(policy, batch), "Depth with its grid cells, and where the action tokens look."))
+    page.row(
+        picture(layout_figure(policy, batch), "The attention mask as the network applied it."),
+        picture(segment_share_figure(policy, batch), "What the action tokens attend to, layer by layer."),
+    )
+    page.write(output)
+
+
+def frame_batch(dataset: LeRobotDataset, frame: int) -> dict:
+    """A frame's observation as a raw batch of one."""
+    item = dataset[frame]
+    batch = {k: v[None] if isinstance(v, torch.Tensor) else v for k, v in item.items() if k.startswith("observation.")}
+    return {**batch, "task": [item["task"]]}

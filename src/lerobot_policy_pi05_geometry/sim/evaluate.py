@@ -1,0 +1,131 @@
+"""A checkpoint in the simulator: which seeds it succeeds on, and what it looked like."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs import preprocess_observation
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION
+from lerobot.policies import make_policy, make_pre_post_processors
+from scipy.stats import binomtest
+
+from ..modeling_pi05_geometry import PI05GeometryPolicy
+from .configuration import MetaworldRgbdEnv
+
+CONFIDENCE = 0.95
+
+
+@dataclass
+class LoadedPolicy:
+    """A policy with its processors, ready to act in an environment."""
+
+    policy: PI05GeometryPolicy
+    preprocess: Callable[[dict], dict]
+    postprocess: Callable[[torch.Tensor], torch.Tensor]
+
+
+@dataclass
+class Evaluation:
+    """Outcome per seed, and frames of the first episodes, (steps, H, W, 3) uint8 each."""
+
+    seeds: list[int] = field(default_factory=list)
+    successes: list[bool] = field(default_factory=list)
+    steps: list[int] = field(default_factory=list)
+    videos: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def rate(self) -> float:
+        """Share of episodes that succeeded."""
+        return float(np.mean(self.successes))
+
+    def interval(self) -> tuple[float, float]:
+        """95 % Wilson interval of the success rate."""
+        interval = binomtest(sum(self.successes), len(self.successes)).proportion_ci(CONFIDENCE, method="wilson")
+        return float(interval.low), float(interval.high)
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything but the videos."""
+        low, high = self.interval()
+        return {
+            "success_rate": self.rate,
+            "interval_95": [low, high],
+            "episodes": len(self.seeds),
+            "per_episode": [
+                {"seed": seed, "success": success, "steps": steps}
+                for seed, success, steps in zip(self.seeds, self.successes, self.steps, strict=True)
+            ],
+        }
+
+
+def load_for_environment(checkpoint: str | Path, environment: MetaworldRgbdEnv, device: str = "cpu") -> LoadedPolicy:
+    """Load a checkpoint folder or hub id and its processors for an environment, as lerobot-eval does."""
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.pretrained_path = Path(checkpoint)
+    config.device = device
+    policy = make_policy(config, env_cfg=environment)
+    preprocess, postprocess = make_pre_post_processors(
+        policy_cfg=config,
+        pretrained_path=str(checkpoint),
+        preprocessor_overrides={"device_processor": {"device": device}},
+    )
+    return LoadedPolicy(policy, preprocess, postprocess)
+
+
+def evaluate(
+    loaded: LoadedPolicy,
+    environment: MetaworldRgbdEnv,
+    episodes: int,
+    first_seed: int = 0,
+    parallel: int = 10,
+    videos: int = 0,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Evaluation:
+    """Run `episodes` episodes on the seeds first_seed, first_seed + 1, ...
+
+    The noise that the policy starts from is drawn per batch of seeds, so that an evaluation repeats exactly.
+    parallel: episodes stepped together. videos: how many of the first episodes to keep frames of. progress: called with
+    the number of episodes done.
+    """
+    result = Evaluation()
+    parallel = min(parallel, episodes)
+    vector = environment.create_envs(parallel)[environment.type][0]
+    try:
+        for start in range(0, episodes, parallel):
+            seeds = [first_seed + start + i for i in range(parallel)]
+            torch.manual_seed(seeds[0])
+            success, steps, frames = _rollout(loaded, vector, seeds)
+            count = min(parallel, episodes - start)
+            result.seeds += seeds[:count]
+            result.successes += success[:count].tolist()
+            result.steps += steps[:count].tolist()
+            for i in range(min(count, videos - len(result.videos))):
+                result.videos.append(np.stack([frame[i] for frame in frames[: steps[i] + 1]]))
+            progress(len(result.seeds))
+    finally:
+        vector.close()
+    return result
+
+
+def _rollout(loaded: LoadedPolicy, vector: Any, seeds: list[int]) -> tuple[np.ndarray, np.ndarray, list]:
+    """One batch of episodes to their ends: success and number of steps per episode, and all frames."""
+    loaded.policy.reset()
+    observation, _ = vector.reset(seed=seeds, options={NEW_ROLLOUT_OPTION: True})
+    done = np.zeros(len(seeds), dtype=bool)
+    success = np.zeros(len(seeds), dtype=bool)
+    steps = np.zeros(len(seeds), dtype=int)
+    frames = [vector.call("render")]
+    while not done.all():
+        batch = preprocess_observation(observation)
+        batch["task"] = list(vector.call("task_description"))
+        with torch.inference_mode():
+            action = loaded.postprocess(loaded.policy.select_action(loaded.preprocess(batch)))
+        observation, _, terminated, truncated, _ = vector.step(action.numpy())
+        steps += ~done
+        success |= terminated & ~done
+        done |= terminated | truncated
+        frames.append(vector.call("render"))
+    return success, steps, frames

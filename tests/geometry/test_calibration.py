@@ -1,0 +1,121 @@
+"""The calibration file: what is written reads back, and what is wrong with it is said in one sentence."""
+
+import json
+
+import pytest
+
+from lerobot_policy_pi05_geometry.geometry.calibration import read_calibration_file, write_calibration_file
+from tests.geometry.scenes import calibrated, generator, random_pose
+
+
+def good_file() -> dict:
+    """The content of a usable calibration file."""
+    pose = random_pose(generator(0)).tolist()
+    entry = {"intrinsics": [600.0, 600.0, 319.5, 239.5], "size": [640, 480], "extrinsics": pose}
+    return {"frame": "base", "cameras": {"front": entry}}
+
+
+def refused(path, content) -> str:
+    """Write `content`, read it as a calibration, and return the one sentence that refuses it."""
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(ValueError) as caught:  # noqa: PT011
+        read_calibration_file(path)
+    message = str(caught.value)
+    assert str(path) in message
+    assert "\n" not in message
+    assert message.endswith(".")
+    return message
+
+
+def test_what_is_written_reads_back(tmp_path):
+    cameras = {
+        "front": calibrated(480, 640, random_pose(generator(1))),
+        "wrist": calibrated(120, 160),
+    }
+    write_calibration_file(tmp_path / "calibration.json", cameras)
+    assert read_calibration_file(str(tmp_path / "calibration.json")) == cameras
+
+
+def test_extrinsics_may_be_left_out(tmp_path):
+    content = good_file()
+    del content["cameras"]["front"]["extrinsics"]
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    assert read_calibration_file(tmp_path / "c.json")["front"].extrinsics is None
+
+
+def test_whole_numbers_are_numbers(tmp_path):
+    content = good_file()
+    content["cameras"]["front"]["intrinsics"] = [600, 600, 320, 240]
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    assert read_calibration_file(tmp_path / "c.json")["front"].intrinsics == [600.0, 600.0, 320.0, 240.0]
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere.json is not there; set --policy.calibration_path"):
+        read_calibration_file(tmp_path / "nowhere.json")
+    with pytest.raises(FileNotFoundError, match=r"is not there"):
+        read_calibration_file(tmp_path)  # a folder
+
+
+@pytest.mark.parametrize("content", ["", "{'frame': 'base'}", '{"frame": "base", ', b"\x89PNG\r\n\x1a\n\xff\xfe"])
+def test_what_is_no_json_is_refused(tmp_path, content):
+    assert "is no JSON" in refused(tmp_path / "c.json", content)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        [],
+        "null",
+        {},
+        {"frame": "base"},
+        {"cameras": {}},
+        {"frame": "base", "cameras": []},
+        {"frame": "base", "cameras": {}, "unit": "m"},
+    ],
+)
+def test_missing_and_unknown_entries_are_refused(tmp_path, content):
+    assert "entries 'frame' and 'cameras'" in refused(tmp_path / "c.json", content)
+
+
+@pytest.mark.parametrize("frame", ["world", "camera", None, 3])
+def test_another_frame_is_refused(tmp_path, frame):
+    assert "only 'base'" in refused(tmp_path / "c.json", good_file() | {"frame": frame})
+
+
+def test_missing_and_unknown_entries_of_a_camera_are_refused(tmp_path):
+    for entry in ({"intrinsics": [1, 1, 0, 0]}, {"size": [4, 4]}, [1, 2], None):
+        content = good_file()
+        content["cameras"]["front"] = entry
+        assert "Camera 'front'" in refused(tmp_path / "c.json", content)
+    content = good_file()
+    content["cameras"]["front"]["distortion"] = [0.1, 0.0]
+    assert "Camera 'front'" in refused(tmp_path / "c.json", content)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("intrinsics", [0.0, 0.0, 0.0, 0.0], "singular"),
+        ("intrinsics", [600.0, 600.0, 320.0], "four finite numbers"),
+        ("intrinsics", [600.0, 600.0, float("nan"), 240.0], "four finite numbers"),
+        ("intrinsics", ["wide", 1, 1, 1], "camera 'front'"),
+        ("intrinsics", 600.0, "camera 'front'"),
+        ("size", [640], "width, height"),
+        ("size", [float("inf"), 480], "camera 'front'"),
+        ("size", None, "camera 'front'"),
+        ("extrinsics", [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "4 rows of 4"),
+        ("extrinsics", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]], "4 rows of 4"),
+        ("extrinsics", [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]], "no rigid transform"),
+        ("extrinsics", [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "no rigid transform"),
+        ("extrinsics", [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "no rigid transform"),
+        ("extrinsics", 5, "camera 'front'"),
+    ],
+)
+def test_unusable_values_are_refused(tmp_path, field, value, said):
+    content = good_file()
+    content["cameras"]["front"][field] = value
+    assert said in refused(tmp_path / "c.json", content).replace("Camera", "camera")

@@ -1,0 +1,687 @@
+"""The policy as LeRobot uses it: training, acting, saving, and what it refuses."""
+
+import copy
+import math
+
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature, RTCAttentionSchedule
+from lerobot.policies.common.flow_matching import euler_integrate
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from lerobot.policies.rtc.modeling_rtc import RTCProcessor
+from lerobot.processor import PolicyProcessorPipeline
+
+from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
+from tests.doors import (
+    ACTION_DIM,
+    CHUNK,
+    FRONT,
+    FRONT_DEPTH,
+    STATE,
+    TOKEN_MASK,
+    TOKENS,
+    WRIST,
+    WRIST_DEPTH,
+    WRIST_POSE,
+    make_batch,
+    make_config,
+    make_features,
+    make_observation,
+    make_policy,
+    make_processors,
+    redraw,
+)
+
+GEOMETRY = (FRONT_DEPTH, WRIST_DEPTH, WRIST_POSE)
+
+
+def without(batch: dict, *keys: str) -> dict:
+    return {key: value for key, value in batch.items() if key not in keys}
+
+
+def chunk_of(policy: PI05GeometryPolicy, batch: dict, **kwargs) -> torch.Tensor:
+    """An action chunk from noise that is always the same."""
+    config = policy.config
+    noise = torch.randn(
+        batch[TOKENS].shape[0], config.chunk_size, config.max_action_dim, generator=torch.Generator().manual_seed(9)
+    )
+    policy.reset()
+    return policy.predict_action_chunk(batch, noise=noise, **kwargs)
+
+
+# --- loss ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("flow_samples", [1, 3])
+def test_the_loss_is_a_number_that_every_trainable_parameter_gets_a_gradient_of(flow_samples):
+    policy = make_policy(flow_samples=flow_samples, geometry_dropout=0.0).train()
+    loss, info = policy.forward(make_batch(3))
+    assert loss.shape == ()
+    assert info["loss"] == pytest.approx(loss.item())
+    assert len(info["loss_per_dim"]) == ACTION_DIM
+    assert sum(info["loss_per_dim"]) / ACTION_DIM == pytest.approx(loss.item(), rel=1e-5)
+    loss.backward()
+    for name, parameter in policy.named_parameters():
+        assert (parameter.grad is not None) == parameter.requires_grad, name
+
+
+@pytest.mark.parametrize("flow_samples", [1, 3])
+@pytest.mark.parametrize("padded", [False, True])
+def test_per_sample_losses_have_the_mean_loss_as_their_mean(padded, flow_samples):
+    policy, batch = make_policy(flow_samples=flow_samples).train(), make_batch(3)
+    valid = torch.tensor([6, 6, 6])
+    if padded:
+        valid = torch.tensor([6, 1, 4])
+        batch["action_is_pad"] = torch.arange(CHUNK)[None] >= valid[:, None]
+    mean, _ = policy.forward(batch)
+    each, info = policy.forward(batch, reduction="none")
+    assert each.shape == (3,)
+    # Every valid step of the batch counts once.
+    torch.testing.assert_close((each * valid).sum() / valid.sum(), mean)
+    assert info["loss"] == pytest.approx(mean.item())
+    each.mean().backward()
+
+
+def test_an_unknown_reduction_is_refused():
+    with pytest.raises(ValueError, match="reduction must be 'mean' or 'none', got 'sum'"):
+        make_policy().forward(make_batch(), reduction="sum")
+
+
+@pytest.mark.parametrize("flow_samples", [1, 3])
+def test_padded_action_steps_are_left_out(flow_samples):
+    policy, batch = make_policy(flow_samples=flow_samples).train(), make_batch(2)
+    batch["action_is_pad"] = torch.zeros(2, CHUNK, dtype=torch.bool)
+    full, _ = policy.forward(batch, reduction="none")
+    without_flag, _ = policy.forward(without(batch, "action_is_pad"), reduction="none")
+    assert torch.equal(full, without_flag)
+    batch["action_is_pad"][1, 4:] = True
+    cut, _ = policy.forward(batch, reduction="none")
+    assert torch.equal(cut[0], full[0])
+    assert not torch.isclose(cut[1], full[1])
+
+
+def test_what_stands_in_padded_action_steps_does_not_change_their_own_loss():
+    """The suffix attends to itself, so noised padding is seen; its own error must not count."""
+    policy, batch = make_policy().train(), make_batch(2)
+    batch["action_is_pad"] = torch.arange(CHUNK)[None].repeat(2, 1) >= 4
+    losses = []
+    policy.model.register_forward_hook(lambda _m, _i, output: losses.append(output))
+    mean, _ = policy.forward(batch)
+    assert mean.item() == pytest.approx(losses[0][:, :4, :ACTION_DIM].mean().item())
+
+
+def test_losses_of_dimensions_that_are_only_padding_are_left_out():
+    """max_action_dim is 8, the action has 5."""
+    policy, batch = make_policy().train(), make_batch(2)
+    losses = []
+    policy.model.register_forward_hook(lambda _m, _i, output: losses.append(output))
+    mean, _ = policy.forward(batch)
+    assert losses[0].shape == (2, CHUNK, 8)
+    assert mean.item() == pytest.approx(losses[0][..., :ACTION_DIM].mean().item())
+
+
+# --- noise, flow time and dropout are keyed -----------------------------------------------------------------------
+
+
+def shuffled(batch: dict, order: list[int]) -> dict:
+    return {
+        key: value[order] if isinstance(value, torch.Tensor) else [value[i] for i in order] for key, value in batch.items()
+    }
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_permuting_a_batch_permutes_its_losses(training):
+    policy, batch, order = make_policy(geometry_dropout=0.5).train(training), make_batch(4), [2, 0, 3, 1]
+    losses, _ = policy.forward(batch, reduction="none")
+    permuted, _ = policy.forward(shuffled(batch, order), reduction="none")
+    torch.testing.assert_close(permuted, losses[order])
+    assert losses.unique().numel() == 4
+    rekeyed, _ = policy.forward(batch | {"index": batch["index"] + 1}, reduction="none")
+    assert (rekeyed - losses).abs().min() > 1e-3
+
+
+def test_the_loss_does_not_depend_on_the_rest_of_the_batch():
+    policy, batch = make_policy().train(), make_batch(3)
+    together, _ = policy.forward(batch, reduction="none")
+    for row in range(3):
+        alone, _ = policy.forward(shuffled(batch, [row]), reduction="none")
+        torch.testing.assert_close(alone[0], together[row])
+
+
+def test_noise_changes_with_the_step_in_training_and_not_in_evaluation():
+    policy, batch = make_policy(), make_batch()
+    for training in (True, False):
+        policy.train(training)
+        before, _ = policy.forward(batch)
+        assert torch.equal(policy.forward(batch)[0], before)  # and not with the call
+        policy.update()
+        assert torch.equal(policy.forward(batch)[0], before) != training
+
+
+def test_noise_depends_on_the_seed_of_the_run():
+    losses = []
+    for seed in (1, 2, 1):
+        torch.manual_seed(seed)
+        policy = redraw(PI05GeometryPolicy(make_config())).train()
+        losses.append(policy.forward(make_batch())[0].item())
+    assert losses[0] == losses[2] != losses[1]
+
+
+def test_geometry_dropout_masks_whole_samples_in_training_only():
+    batch = make_batch(16)
+    pads = []
+
+    def forward(dropout: float, training: bool) -> torch.Tensor:
+        policy = make_policy(geometry_dropout=dropout).train(training)
+        policy.model.register_forward_hook(lambda _m, inputs, _o: pads.append(inputs[8]))
+        return policy.forward(batch, reduction="none")[0]
+
+    open_loss, half_loss, masked_loss = (forward(dropout, True) for dropout in (0.0, 0.5, 0.999999))
+    assert pads[0].any(dim=1).all()
+    assert not pads[2].any()
+    masked = ~pads[1].any(dim=1)
+    assert 2 <= masked.sum() <= 14
+    assert torch.equal(pads[1][~masked], pads[0][~masked])
+    torch.testing.assert_close(half_loss[masked], masked_loss[masked])
+    torch.testing.assert_close(half_loss[~masked], open_loss[~masked])
+    assert (open_loss - masked_loss).abs().min() > 1e-4
+    assert torch.equal(forward(0.999999, False), forward(0.0, False))
+
+
+def test_a_sample_without_geometry_is_a_sample_of_the_plain_policy():
+    plain = make_policy(geometry_source="none").train()
+    policy = make_policy(geometry_dropout=0.999999).train()
+    policy.load_state_dict(plain.state_dict(), strict=False)
+    torch.testing.assert_close(policy.forward(make_batch())[0], plain.forward(make_batch())[0])
+
+
+# --- the optimiser ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"train_expert_only": True}, {"freeze_vision_encoder": True}, {"geometry_expert": "own"}]
+)
+def test_parameter_groups_hold_every_trainable_parameter_once(changes):
+    policy = make_policy(geometry_lr=3e-4, geometry_eps=1e-11, **changes)
+    groups = policy.get_optim_params()
+    names = {id(parameter): name for name, parameter in policy.named_parameters()}
+    grouped = [[names[id(p)] for p in group["params"]] for group in groups]
+    assert sorted(grouped[0] + grouped[1]) == sorted(n for n, p in policy.named_parameters() if p.requires_grad)
+    new = {name for name in names.values() if name.startswith("geometry.") or "geometry_gate" in name}
+    assert new <= set(grouped[1])
+    assert {k: v for k, v in groups[1].items() if k != "params"} == {"lr": 3e-4, "eps": 1e-11, "weight_decay": 0.0}
+    assert set(groups[0]) == {"params"}
+    optimizer = policy.config.get_optimizer_preset().build(groups)
+    assert [group["lr"] for group in optimizer.param_groups] == [2.5e-5, 3e-4]
+
+
+def test_a_policy_without_geometry_has_one_group():
+    policy = make_policy(geometry_source="none")
+    assert len(policy.get_optim_params()) == 1
+    assert not policy.new_parameters()
+
+
+def test_an_optimiser_step_is_counted_and_measured():
+    policy, batch = make_policy().train(), make_batch()
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    infos = []
+    for step in range(3):
+        assert policy.training_step.item() == step
+        loss, info = policy.forward(batch)
+        infos.append(info)
+        loss.backward()
+        before = torch.cat([p.detach().flatten() for p in policy.new_parameters().values()])
+        optimizer.step()
+        optimizer.zero_grad()
+        policy.update()
+    after = torch.cat([p.detach().flatten() for p in policy.new_parameters().values()])
+    _, info = policy.forward(batch)
+    assert info["geometry_update"] == pytest.approx(((after - before).norm() / before.norm()).item(), rel=1e-4)
+    assert 0 < info["geometry_update"] < 0.1
+    gate = policy.model.paligemma_with_expert.geometry_gate
+    assert info["gate_openness"] == pytest.approx(gate.log_gate.exp().mean().item())
+    assert "geometry_update" not in infos[0]
+    assert "geometry_update" in infos[2]
+
+
+# --- acting -------------------------------------------------------------------------------------------------------
+
+
+def test_a_chunk_has_the_shape_of_the_action_and_follows_its_noise():
+    policy, batch = make_policy(), make_batch(3)
+    chunk = chunk_of(policy, batch)
+    assert chunk.shape == (3, CHUNK, ACTION_DIM)
+    assert torch.equal(chunk_of(policy, batch), chunk)
+    assert not torch.allclose(policy.predict_action_chunk(batch, noise=torch.zeros(3, CHUNK, 8)), chunk)
+    assert not torch.allclose(chunk_of(policy, batch, num_steps=7), chunk)
+    torch.manual_seed(3)
+    drawn = policy.predict_action_chunk(batch)
+    assert not torch.allclose(policy.predict_action_chunk(batch), drawn)
+    torch.manual_seed(3)
+    assert torch.equal(policy.predict_action_chunk(batch), drawn)
+
+
+def test_actions_leave_the_queue_one_by_one_until_it_is_empty():
+    policy, batch = make_policy(n_action_steps=4), make_batch(2)
+    noise = torch.randn(2, CHUNK, 8)
+    chunk = policy.predict_action_chunk(batch, noise=noise)
+    policy.reset()
+    for step in range(4):
+        assert torch.equal(policy.select_action(batch, noise=noise), chunk[:, step])
+    other = make_batch(2, seed=5)
+    assert torch.equal(policy.select_action(other, noise=noise), policy.predict_action_chunk(other, noise=noise)[:, 0])
+
+
+def test_reset_forgets_the_queue():
+    policy, batch, noise = make_policy(), make_batch(2), torch.randn(2, CHUNK, 8)
+    first = policy.select_action(batch, noise=noise)
+    policy.reset()
+    assert torch.equal(policy.select_action(batch, noise=noise), first)
+    policy.reset()
+    other = make_batch(2, seed=5)
+    assert torch.equal(policy.select_action(other, noise=noise), policy.predict_action_chunk(other, noise=noise)[:, 0])
+
+
+def test_acting_builds_no_graph_and_leaves_training_mode():
+    policy = make_policy().train()
+    assert not policy.select_action(make_batch()).requires_grad
+    assert not policy.training
+    assert not policy.predict_action_chunk(make_batch()).requires_grad
+
+
+def test_geometry_matters():
+    policy, batch = make_policy(), make_batch()
+    for key in GEOMETRY:
+        changed = batch | {key: make_batch(seed=7)[key]}
+        assert (chunk_of(policy, changed) - chunk_of(policy, batch)).abs().max() > 1e-4, key
+
+
+def test_a_depth_camera_may_fail_in_the_middle_of_an_episode(caplog):
+    policy, batch = make_policy(n_action_steps=1), make_batch(1)
+    policy.reset()
+    policy.select_action(batch)
+    for broken in (without(batch, FRONT_DEPTH), batch | {FRONT_DEPTH: torch.full_like(batch[FRONT_DEPTH], math.nan)}):
+        assert policy.select_action(broken).isfinite().all()
+    assert policy.select_action(without(batch, FRONT_DEPTH, WRIST_DEPTH)).isfinite().all()
+    assert sum("'front'" in record.getMessage() for record in caplog.records) == 1
+    noise = torch.zeros(1, CHUNK, 8)
+    recovered = policy.predict_action_chunk(batch, noise=noise)
+    assert torch.equal(recovered, make_policy(n_action_steps=1).predict_action_chunk(batch, noise=noise))
+
+
+# --- saving -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"dtype": "bfloat16", "param_dtype": "bfloat16"},
+        {"geometry_source": "none"},
+        {"geometry_source": "random"},
+        {"geometry_expert": "own", "geometry_positions": "parallel"},
+        {"geometry_placement": "prefix", "geometry_frame": "camera"},
+        {"geometry_cameras": ["wrist"]},
+    ],
+    ids=lambda changes: "-".join(map(str, changes.values())) or "default",
+)
+def test_a_saved_policy_acts_as_before_bit_for_bit(tmp_path, changes):
+    policy, batch = make_policy(**changes), make_batch()
+    policy.update()
+    policy.save_pretrained(tmp_path)
+    loaded = PI05GeometryPolicy.from_pretrained(tmp_path)
+    assert not loaded.training
+    assert loaded.training_step.item() == 1
+    assert loaded.config == policy.config
+    for (name, expected), (found_name, found) in zip(
+        policy.state_dict().items(), loaded.state_dict().items(), strict=True
+    ):
+        assert name == found_name
+        assert found.dtype == expected.dtype, name
+        assert torch.equal(found, expected), name
+    assert {n: p.requires_grad for n, p in loaded.named_parameters()} == {
+        n: p.requires_grad for n, p in policy.named_parameters()
+    }
+    assert torch.equal(chunk_of(loaded, batch), chunk_of(policy, batch))
+    loss, _ = loaded.train().forward(batch)  # and it can be trained on
+    loss.backward()
+
+
+def test_what_must_stay_float32_does():
+    policy = make_policy(dtype="bfloat16", param_dtype="bfloat16")
+    dtypes = {name: parameter.dtype for name, parameter in policy.named_parameters()}
+    for name in policy.new_parameters():
+        assert dtypes[name] == torch.float32, name
+    assert dtypes["model.action_out_proj.weight"] == torch.float32
+    assert torch.bfloat16 in dtypes.values()
+
+
+def test_the_calibration_travels_in_the_checkpoint(tmp_path):
+    policy, batch = make_policy(), make_batch()
+    policy.config.calibration["front"].extrinsics[0][3] += 0.3
+    moved = redraw(PI05GeometryPolicy(make_config(calibration=policy.config.calibration))).eval()
+    moved.save_pretrained(tmp_path)
+    loaded = PI05GeometryPolicy.from_pretrained(tmp_path)
+    assert torch.equal(chunk_of(loaded, batch), chunk_of(moved, batch))
+    assert not torch.allclose(chunk_of(loaded, batch), chunk_of(policy, batch))
+
+
+def test_loading_leaves_the_given_configuration_on_its_device(tmp_path):
+    make_policy().save_pretrained(tmp_path)
+    config = make_config()
+    config.device = "cpu:0"
+    assert PI05GeometryPolicy.from_pretrained(tmp_path, config=config).config.device == "cpu:0"
+
+
+# --- shapes -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("state_dim", [1, 7, 32, 40])
+def test_any_state_width_goes_through_the_prompt(state_dim):
+    inputs, outputs = make_features()
+    inputs[STATE] = PolicyFeature(FeatureType.STATE, (state_dim,))
+    config = make_config(input_features=inputs, output_features=outputs, normalization_mapping={})
+    preprocessor, _ = make_processors(config)
+    policy = redraw(PI05GeometryPolicy(config)).eval()
+    batch = preprocessor(make_observation() | {STATE: torch.linspace(-1, 1, state_dim).repeat(2, 1)})
+    assert f"State: {' '.join(['0'] * (state_dim == 1))}" in batch["task"][0]
+    assert len(batch["task"][0].split("State: ")[1].split(";")[0].split()) == state_dim
+    assert policy.predict_action_chunk(batch).shape == (2, CHUNK, ACTION_DIM)
+
+
+@pytest.mark.parametrize(("action_dim", "max_action_dim"), [(1, 8), (5, 5), (5, 32)])
+def test_any_action_width_up_to_the_largest(action_dim, max_action_dim):
+    inputs, outputs = make_features()
+    outputs["action"] = PolicyFeature(FeatureType.ACTION, (action_dim,))
+    policy = make_policy(input_features=inputs, output_features=outputs, max_action_dim=max_action_dim)
+    batch = make_batch() | {"action": torch.randn(2, CHUNK, action_dim)}
+    policy.train().forward(batch)[0].backward()
+    assert policy.predict_action_chunk(batch).shape == (2, CHUNK, action_dim)
+
+
+# --- images -------------------------------------------------------------------------------------------------------
+
+
+def test_uint8_and_channel_last_images_equal_float_channel_first():
+    policy, batch = make_policy(), make_batch()
+    batch[FRONT] = (255 * batch[FRONT]).round() / 255
+    expected = chunk_of(policy, batch)
+    as_bytes = (255 * batch[FRONT]).round().to(torch.uint8)
+    for image in (as_bytes, batch[FRONT].permute(0, 2, 3, 1), as_bytes.permute(0, 2, 3, 1), batch[FRONT].double()):
+        torch.testing.assert_close(chunk_of(policy, batch | {FRONT: image}), expected, atol=1e-5, rtol=1e-5)
+
+
+def test_every_camera_matters():
+    policy, batch = make_policy(), make_batch()
+    for key in (FRONT, WRIST):
+        assert (chunk_of(policy, batch | {key: 1 - batch[key]}) - chunk_of(policy, batch)).abs().max() > 1e-4, key
+
+
+def test_a_missing_rgb_camera_is_refused():
+    for policy in (make_policy(), make_policy(absent_cameras=[FRONT])):
+        with pytest.raises(ValueError, match=rf"no image {WRIST}; connect the camera.*--policy.absent_cameras"):
+            policy.predict_action_chunk(without(make_batch(), WRIST))
+        with pytest.raises(ValueError, match=rf"no image {WRIST}"):
+            policy.train().forward(without(make_batch(), WRIST))
+
+
+def test_a_camera_that_may_be_absent_is_left_out_of_attention():
+    policy, batch = make_policy(absent_cameras=[WRIST]), make_batch()
+    absent = chunk_of(policy, without(batch, WRIST))
+    policy.train().forward(without(batch, WRIST))[0].backward()
+    assert (absent - chunk_of(policy, batch)).abs().max() > 1e-4
+    black = chunk_of(policy, batch | {WRIST: torch.zeros_like(batch[WRIST])})
+    assert (absent - black).abs().max() > 1e-4
+
+
+def test_empty_cameras_change_nothing():
+    """They stand for cameras that a checkpoint was made for and this robot has not."""
+    expected = chunk_of(make_policy(), make_batch())
+    with_empty = make_policy(empty_cameras=2)
+    assert len(with_empty.config.image_features) == 4
+    torch.testing.assert_close(chunk_of(with_empty, make_batch()), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(2, 1, 30, 40), (2, 4, 30, 40), (3, 30, 40), (2, 30, 40)])
+def test_an_image_that_is_not_rgb_is_refused(shape):
+    with pytest.raises(ValueError, match=rf"{FRONT} must be RGB images \(B, 3, H, W\), got shape"):
+        make_policy().predict_action_chunk(make_batch() | {FRONT: torch.rand(shape)})
+
+
+# --- sources ------------------------------------------------------------------------------------------------------
+
+
+def test_without_geometry_depth_is_not_looked_at():
+    policy, batch = make_policy(geometry_source="none"), make_batch()
+    assert policy.geometry is None
+    assert torch.equal(chunk_of(policy, without(batch, *GEOMETRY)), chunk_of(policy, batch))
+    policy.train().forward(batch)[0].backward()
+
+
+def test_random_tokens_take_as_much_room_and_look_at_nothing():
+    policy, batch = make_policy(geometry_source="random"), make_batch()
+    assert policy.geometry.source.num_tokens == make_policy().geometry.source.num_tokens
+    assert torch.equal(chunk_of(policy, without(batch, *GEOMETRY)), chunk_of(policy, batch))
+    plain = make_policy(geometry_source="none")
+    plain.load_state_dict({k: v for k, v in policy.state_dict().items() if k in plain.state_dict()})
+    assert (chunk_of(plain, batch) - chunk_of(policy, batch)).abs().max() > 1e-4
+    policy.train().forward(batch)[0].backward()
+
+
+@pytest.mark.parametrize("source", ["none", "random"])
+def test_a_blind_policy_trains_and_acts(source):
+    _, outputs = make_features()
+    inputs = {STATE: PolicyFeature(FeatureType.STATE, (7,))}
+    policy = make_policy(input_features=inputs, output_features=outputs, geometry_source=source).train()
+    batch = without(make_batch(), FRONT, WRIST, *GEOMETRY)
+    policy.forward(batch)[0].backward()
+    for name, parameter in policy.named_parameters():
+        assert (parameter.grad is not None) == parameter.requires_grad, name
+    assert chunk_of(policy, batch).shape == (2, CHUNK, ACTION_DIM)
+
+
+def test_depth_cameras_need_depth_in_the_data():
+    inputs, outputs = make_features()
+    inputs = {key: feature for key, feature in inputs.items() if key not in GEOMETRY}
+    with pytest.raises(ValueError, match=r"geometry_source=rgbd needs depth.*geometry_source=none"):
+        make_policy(input_features=inputs, output_features=outputs)
+
+
+def test_depth_cameras_need_intrinsics():
+    calibration = make_config().calibration
+    del calibration["wrist"]
+    with pytest.raises(ValueError, match=r"Depth camera 'wrist' has no intrinsics \(the calibration has front\)"):
+        make_policy(calibration=calibration)
+    assert make_policy(calibration=calibration, geometry_cameras=["front"]).geometry.source.cameras == ("front",)
+    calibration["wrist"] = copy.deepcopy(calibration["front"])
+    calibration["wrist"].intrinsics[0] = 0.0
+    with pytest.raises(ValueError, match=r"Intrinsics of camera 'wrist' are singular"):
+        make_policy(calibration=calibration)
+
+
+# --- nothing leaks ------------------------------------------------------------------------------------------------
+
+
+def other_geometry(batch: dict) -> dict:
+    """The same batch with other depth and another pose."""
+    return batch | {key: make_observation(seed=7)[key] for key in GEOMETRY}
+
+
+def test_geometry_reaches_neither_the_prompt_nor_siglip_nor_the_normaliser():
+    config = make_config()
+    preprocessor, _ = make_processors(config)
+    policy = redraw(PI05GeometryPolicy(config)).eval()
+    seen = []
+    tower = policy.model.paligemma_with_expert.paligemma.model.vision_tower
+    tower.register_forward_hook(
+        lambda _m, args, kwargs, _o: seen.append(args[0] if args else kwargs["pixel_values"]), with_kwargs=True
+    )
+    raw = make_observation()
+    outputs = []
+    for observation in (raw, other_geometry(raw)):
+        processed = preprocessor(dict(observation))
+        for key in GEOMETRY:
+            assert torch.equal(processed[key], observation[key]), key
+        policy.predict_action_chunk(processed)
+        outputs.append(processed)
+    for key, value in without(outputs[0], *GEOMETRY).items():
+        other = outputs[1][key]
+        assert torch.equal(value, other) if isinstance(value, torch.Tensor) else value == other, key
+    assert len(seen) == 2
+    assert torch.equal(seen[0], seen[1])
+    assert seen[0].shape == (4, 3, 28, 28)  # two RGB cameras, a batch of two
+    assert outputs[0]["task"][0].count(" ") == 8 + STATE_SPACES
+
+
+STATE_SPACES = 1  # "...;\nAction: " ends with one
+
+
+def test_the_normaliser_does_not_know_geometry():
+    """Statistics of depth and poses are in every dataset; they must not be applied."""
+    config = make_config()
+    preprocessor, _ = make_processors(config)
+    (normaliser,) = (step for step in preprocessor.steps if hasattr(step, "norm_map"))
+    assert set(normaliser.features) == {FRONT, WRIST, STATE, "action"}
+
+
+def test_processors_may_be_made_before_the_policy():
+    """Whatever is made first, depth and poses come through untouched."""
+    from lerobot_policy_pi05_geometry.processor_pi05_geometry import make_pi05_geometry_pre_post_processors
+
+    spread = {"q01": -torch.ones(4, 4), "q99": 3 * torch.ones(4, 4)}
+    preprocessor, _ = make_pi05_geometry_pre_post_processors(make_config(), {WRIST_POSE: spread})
+    observation = make_observation()
+    assert torch.equal(preprocessor(dict(observation))[WRIST_POSE], observation[WRIST_POSE])
+
+
+# --- processors ---------------------------------------------------------------------------------------------------
+
+
+def test_actions_survive_normalising_and_back():
+    preprocessor, postprocessor = make_processors(make_config())
+    action = torch.randn(2, CHUNK, ACTION_DIM)
+    processed = preprocessor(make_observation() | {"action": action})
+    assert not torch.allclose(processed["action"], action)
+    torch.testing.assert_close(postprocessor(processed["action"]), action)
+
+
+@pytest.mark.parametrize("excluded", [[], ["gripper"]])
+def test_relative_actions_survive_the_way_there_and_back(excluded):
+    names = ["x", "y", "z", "turn", "gripper"]
+    config = make_config(use_relative_actions=True, relative_exclude_joints=excluded, action_feature_names=names)
+    preprocessor, postprocessor = make_processors(config)
+    absolute = make_processors(make_config())[0]
+    observation, action = make_observation(), torch.randn(2, CHUNK, ACTION_DIM)
+    state = observation[STATE]
+    processed = preprocessor(observation | {"action": action})
+    offset = state[:, None, :ACTION_DIM].clone()
+    offset[..., ACTION_DIM - len(excluded) :] = 0.0
+    expected = absolute(observation | {"action": action - offset})["action"]
+    torch.testing.assert_close(processed["action"], expected)
+    torch.testing.assert_close(postprocessor(processed["action"]), action)
+
+
+def test_keys_can_be_renamed_depth_included(tmp_path):
+    config = make_config()
+    preprocessor, _ = make_processors(config)
+    preprocessor.save_pretrained(tmp_path)
+    names = {FRONT: "observation.images.top", FRONT_DEPTH: "observation.images.top_depth"}
+    renamed = PolicyProcessorPipeline.from_pretrained(
+        tmp_path,
+        config_filename="policy_preprocessor.json",
+        overrides={"rename_observations_processor": {"rename_map": {new: old for old, new in names.items()}}},
+    )
+    policy = redraw(PI05GeometryPolicy(config)).eval()
+    observation = make_observation()
+    incoming = {names.get(key, key): value for key, value in observation.items()}
+    assert torch.equal(chunk_of(policy, renamed(incoming)), chunk_of(policy, preprocessor(observation)))
+    policy = redraw(PI05GeometryPolicy(make_config())).eval()
+    with pytest.raises(ValueError, match=r"no image observation.images.front.*--rename_map"):
+        policy.predict_action_chunk(preprocessor(incoming))
+    with pytest.raises(ValueError, match=r"no depth from camera\(s\) front.*--rename_map"):
+        policy.predict_action_chunk(preprocessor(incoming | {FRONT: observation[FRONT]}))
+
+
+def test_an_observation_without_a_batch_gets_one():
+    config = make_config()
+    preprocessor, _ = make_processors(config)
+    policy = redraw(PI05GeometryPolicy(config)).eval()
+    batch = make_observation(1)
+    single = {key: value[0] for key, value in batch.items()}
+    assert torch.equal(chunk_of(policy, preprocessor(single)), chunk_of(policy, preprocessor(batch)))
+
+
+def test_a_state_that_is_no_number_is_refused():
+    preprocessor, _ = make_processors(make_config())
+    observation = make_observation()
+    observation[STATE][1, 2] = math.nan
+    with pytest.raises(ValueError, match=r"observation.state\[2\] is nan in sample 1"):
+        preprocessor(observation)
+
+
+# --- real-time chunking -------------------------------------------------------------------------------------------
+
+
+def make_rtc_policy(enabled: bool = True) -> PI05GeometryPolicy:
+    config = RTCConfig(
+        enabled=enabled, execution_horizon=4, prefix_attention_schedule=RTCAttentionSchedule.LINEAR, max_guidance_weight=5.0
+    )
+    return make_policy(rtc_config=config)
+
+
+def test_guided_chunks_follow_what_is_left_of_the_previous_one():
+    policy, batch, noise = make_rtc_policy(), make_batch(1), torch.randn(1, CHUNK, 8)
+    plain = make_policy().predict_action_chunk(batch, noise=noise)
+    unguided = policy.predict_action_chunk(batch, noise=noise)
+    assert torch.equal(unguided, plain)  # nothing is left over yet
+    left_over = plain + 1.0
+    guided = policy.predict_action_chunk(
+        batch, noise=noise, prev_chunk_left_over=left_over, inference_delay=2, execution_horizon=4
+    )
+    distance, unguided_distance = (guided - left_over).abs(), (unguided - left_over).abs()
+    assert (distance[:, :2] < 0.5 * unguided_distance[:, :2]).all()
+    assert not guided.requires_grad
+
+
+@pytest.mark.parametrize("left", [6, 3])
+def test_guidance_is_lerobots(left):
+    """The same as LeRobot's integrator and guidance around a network that recomputes everything at every step."""
+    policy, batch, noise = make_rtc_policy(), make_batch(2), torch.randn(2, CHUNK, 8)
+    left_over = torch.randn(2, left, ACTION_DIM)
+    rtc = {"prev_chunk_left_over": left_over, "inference_delay": 1, "execution_horizon": 4}
+    guided = policy.predict_action_chunk(batch, noise=noise, **rtc)
+
+    velocities = make_policy()  # without RTC: one Euler step of size 1 from t = 1 gives x - v
+
+    def velocity(x: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        network, embed = velocities.model, velocities._geometry_tokens(batch)
+        from lerobot_policy_pi05_geometry.inputs import prepare_images
+
+        images, masks = prepare_images(batch, velocities.config, torch.device("cpu"))
+        zero = torch.zeros_like(x)
+        with torch.no_grad():  # with action 0 and noise x / t, the network is run at x, and (v - noise)² is its loss
+            prefix, geometry = network._context(images, masks, batch[TOKENS], batch[TOKEN_MASK], *embed, None)
+            return network._velocity(prefix, geometry, None, x + zero, time)
+
+    expected = euler_integrate(
+        velocity, noise, 3, rtc_processor=RTCProcessor(policy.config.rtc_config), rtc_enabled=True, **rtc
+    )
+    torch.testing.assert_close(guided, expected[..., :ACTION_DIM], atol=1e-5, rtol=1e-5)
+
+
+def test_rtc_works_on_whole_chunks():
+    with pytest.raises(RuntimeError, match=r"call predict_action_chunk, not select_action"):
+        make_rtc_policy().select_action(make_batch())
+    assert make_rtc_policy(enabled=False).select_action(make_batch()).shape == (2, ACTION_DIM)
+
+
+def test_rtc_can_be_switched_on_after_loading():
+    """As LeRobot's rollout does it: set the configuration, then call `init_rtc_processor`."""
+    policy = make_policy()
+    assert policy.supports_rtc()
+    policy.config.rtc_config = make_rtc_policy().config.rtc_config
+    policy.init_rtc_processor()
+    batch, noise = make_batch(1), torch.randn(1, CHUNK, 8)
+    rtc = {"prev_chunk_left_over": torch.randn(1, 4, ACTION_DIM), "inference_delay": 1, "execution_horizon": 4}
+    found = policy.predict_action_chunk(batch, noise=noise, **rtc)
+    assert torch.equal(found, make_rtc_policy().predict_action_chunk(batch, noise=noise, **rtc))
