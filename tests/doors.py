@@ -17,8 +17,6 @@ WRIST_POSE = "observation.calibration.wrist.extrinsics"
 STATE, TOKENS, TOKEN_MASK = "observation.state", "observation.language.tokens", "observation.language.attention_mask"
 STATE_DIM, ACTION_DIM, CHUNK = 7, 5, 6
 
-FRONT_POSE = [[0.0, -0.6, 0.8, -0.5], [-1.0, 0.0, 0.0, 0.1], [0.0, -0.8, -0.6, 0.7], [0.0, 0.0, 0.0, 1.0]]
-
 
 def make_features() -> tuple[dict[str, PolicyFeature], dict[str, PolicyFeature]]:
     """Inputs and outputs as LeRobot types them: two RGB-D cameras, the second with a pose in every frame."""
@@ -34,8 +32,9 @@ def make_features() -> tuple[dict[str, PolicyFeature], dict[str, PolicyFeature]]
 
 
 def make_calibration() -> dict[str, CameraCalibration]:
+    pose = [[0.0, -0.6, 0.8, -0.5], [-1.0, 0.0, 0.0, 0.1], [0.0, -0.8, -0.6, 0.7], [0.0, 0.0, 0.0, 1.0]]
     return {
-        "front": CameraCalibration([30.0, 30.0, 19.5, 14.5], [40, 30], FRONT_POSE),
+        "front": CameraCalibration([30.0, 30.0, 19.5, 14.5], [40, 30], pose),
         "wrist": CameraCalibration([12.0, 12.0, 5.5, 5.5], [12, 12]),
     }
 

@@ -11,7 +11,9 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from lerobot.processor import PolicyProcessorPipeline
 
+from lerobot_policy_pi05_geometry.inputs import prepare_images
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
+from lerobot_policy_pi05_geometry.processor_pi05_geometry import make_pi05_geometry_pre_post_processors
 from tests.doors import (
     ACTION_DIM,
     CHUNK,
@@ -24,6 +26,7 @@ from tests.doors import (
     WRIST_DEPTH,
     WRIST_POSE,
     make_batch,
+    make_calibration,
     make_config,
     make_features,
     make_observation,
@@ -125,7 +128,8 @@ def test_losses_of_dimensions_that_are_only_padding_are_left_out():
 
 def shuffled(batch: dict, order: list[int]) -> dict:
     return {
-        key: value[order] if isinstance(value, torch.Tensor) else [value[i] for i in order] for key, value in batch.items()
+        key: value[order] if isinstance(value, torch.Tensor) else [value[i] for i in order]
+        for key, value in batch.items()
     }
 
 
@@ -158,9 +162,18 @@ def test_noise_changes_with_the_step_in_training_and_not_in_evaluation():
         assert torch.equal(policy.forward(batch)[0], before) != training
 
 
+def test_evaluation_draws_other_noise_than_any_training_step():
+    policy, batch = make_policy(geometry_dropout=0.0), make_batch()
+    evaluated = policy.forward(batch)[0].item()
+    policy.train()
+    for _ in range(3):
+        assert abs(policy.forward(batch)[0].item() - evaluated) > 1e-4
+        policy.update()
+
+
 def test_noise_depends_on_the_seed_of_the_run():
     losses = []
-    for seed in (1, 2, 1):
+    for seed in (2**63 + 1, 2**63 + 2, 2**63 + 1):
         torch.manual_seed(seed)
         policy = redraw(PI05GeometryPolicy(make_config())).train()
         losses.append(policy.forward(make_batch())[0].item())
@@ -358,8 +371,9 @@ def test_what_must_stay_float32_does():
 
 def test_the_calibration_travels_in_the_checkpoint(tmp_path):
     policy, batch = make_policy(), make_batch()
-    policy.config.calibration["front"].extrinsics[0][3] += 0.3
-    moved = redraw(PI05GeometryPolicy(make_config(calibration=policy.config.calibration))).eval()
+    calibration = make_calibration()
+    calibration["front"].extrinsics[0][3] += 0.3
+    moved = make_policy(calibration=calibration)
     moved.save_pretrained(tmp_path)
     loaded = PI05GeometryPolicy.from_pretrained(tmp_path)
     assert torch.equal(chunk_of(loaded, batch), chunk_of(moved, batch))
@@ -488,7 +502,7 @@ def test_depth_cameras_need_depth_in_the_data():
 
 
 def test_depth_cameras_need_intrinsics():
-    calibration = make_config().calibration
+    calibration = make_calibration()
     del calibration["wrist"]
     with pytest.raises(ValueError, match=r"Depth camera 'wrist' has no intrinsics \(the calibration has front\)"):
         make_policy(calibration=calibration)
@@ -530,10 +544,6 @@ def test_geometry_reaches_neither_the_prompt_nor_siglip_nor_the_normaliser():
     assert len(seen) == 2
     assert torch.equal(seen[0], seen[1])
     assert seen[0].shape == (4, 3, 28, 28)  # two RGB cameras, a batch of two
-    assert outputs[0]["task"][0].count(" ") == 8 + STATE_SPACES
-
-
-STATE_SPACES = 1  # "...;\nAction: " ends with one
 
 
 def test_the_normaliser_does_not_know_geometry():
@@ -546,8 +556,6 @@ def test_the_normaliser_does_not_know_geometry():
 
 def test_processors_may_be_made_before_the_policy():
     """Whatever is made first, depth and poses come through untouched."""
-    from lerobot_policy_pi05_geometry.processor_pi05_geometry import make_pi05_geometry_pre_post_processors
-
     spread = {"q01": -torch.ones(4, 4), "q99": 3 * torch.ones(4, 4)}
     preprocessor, _ = make_pi05_geometry_pre_post_processors(make_config(), {WRIST_POSE: spread})
     observation = make_observation()
@@ -624,7 +632,10 @@ def test_a_state_that_is_no_number_is_refused():
 
 def make_rtc_policy(enabled: bool = True) -> PI05GeometryPolicy:
     config = RTCConfig(
-        enabled=enabled, execution_horizon=4, prefix_attention_schedule=RTCAttentionSchedule.LINEAR, max_guidance_weight=5.0
+        enabled=enabled,
+        execution_horizon=4,
+        prefix_attention_schedule=RTCAttentionSchedule.LINEAR,
+        max_guidance_weight=5.0,
     )
     return make_policy(rtc_config=config)
 
@@ -651,17 +662,14 @@ def test_guidance_is_lerobots(left):
     rtc = {"prev_chunk_left_over": left_over, "inference_delay": 1, "execution_horizon": 4}
     guided = policy.predict_action_chunk(batch, noise=noise, **rtc)
 
-    velocities = make_policy()  # without RTC: one Euler step of size 1 from t = 1 gives x - v
+    plain = make_policy()
+    images, masks = prepare_images(batch, plain.config, torch.device("cpu"))
+    context = plain.model._context(
+        images, masks, batch[TOKENS], batch[TOKEN_MASK], *plain._geometry_tokens(batch), None
+    )
 
-    def velocity(x: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
-        network, embed = velocities.model, velocities._geometry_tokens(batch)
-        from lerobot_policy_pi05_geometry.inputs import prepare_images
-
-        images, masks = prepare_images(batch, velocities.config, torch.device("cpu"))
-        zero = torch.zeros_like(x)
-        with torch.no_grad():  # with action 0 and noise x / t, the network is run at x, and (v - noise)² is its loss
-            prefix, geometry = network._context(images, masks, batch[TOKENS], batch[TOKEN_MASK], *embed, None)
-            return network._velocity(prefix, geometry, None, x + zero, time)
+    def velocity(x_t: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        return plain.model._velocity(*context, None, x_t, time)
 
     expected = euler_integrate(
         velocity, noise, 3, rtc_processor=RTCProcessor(policy.config.rtc_config), rtc_enabled=True, **rtc

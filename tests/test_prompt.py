@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from lerobot.lerobot_types import TransitionKey
 from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
@@ -38,16 +38,18 @@ def openpi_bins(state: torch.Tensor) -> np.ndarray:
     return np.digitize(state.numpy(), bins=np.linspace(-1, 1, 256 + 1)[:-1]) - 1
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
+@example(values=[-1e-20, 1e-20])
 @given(values=st.lists(st.floats(-1, 1, width=32), min_size=1, max_size=9))
 def test_bins_are_openpis_inside_the_range(values):
     state = torch.tensor([values])
     assert discretise_state(state).tolist() == openpi_bins(state).tolist()
 
 
-def test_bins_are_openpis_on_every_edge():
+@pytest.mark.parametrize("step", [-1e-6, 0.0, 1e-6])
+def test_bins_are_openpis_at_every_edge(step):
     edges = torch.linspace(-1, 1, 257, dtype=torch.float64)
-    state = torch.stack([edges, edges.nextafter(torch.tensor(-2.0).double()), edges.nextafter(edges + 1)]).clamp(-1, 1)
+    state = (edges + step).clamp(-1, 1)[None]
     assert discretise_state(state).tolist() == openpi_bins(state).tolist()
     assert discretise_state(edges[None])[0, [0, 128, 256]].tolist() == [0, 128, 255]
 
@@ -75,9 +77,8 @@ def transition(state: torch.Tensor | None, task: str | list[str] | None) -> dict
     return {TransitionKey.OBSERVATION: observation, TransitionKey.COMPLEMENTARY_DATA: data}
 
 
-@settings(max_examples=25, deadline=None)
 @given(
-    state=st.lists(st.floats(-1, 1, width=32), min_size=1, max_size=40),
+    state=st.lists(st.floats(-1, 1, width=16), min_size=1, max_size=40),
     task=st.text("abc _\n.,XY12", max_size=20),
 )
 def test_the_prompt_is_lerobots_for_a_state_in_range(state, task):
@@ -120,7 +121,7 @@ def test_the_built_in_tokenizer_is_always_the_same(built_in):
         assert build_small_tokenizer().backend_tokenizer.to_str() == built_in.backend_tokenizer.to_str()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(text=st.text(st.characters(exclude_categories=["Cs"]), max_size=40))
 def test_the_built_in_tokenizer_encodes_any_text(built_in, text):
     ids = built_in(text)["input_ids"]

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_policy_pi05_geometry.geometry.adapter import GeometryAdapter
@@ -30,7 +30,6 @@ def random_features(seed: int, batch: int, views: int, grid: int) -> GeometryFea
     )
 
 
-@settings(max_examples=15, deadline=None)
 @given(seed=seeds, batch=st.integers(1, 3), views=st.integers(1, 3), grid=st.sampled_from([1, 2, 3, 8]))
 def test_cells_stand_camera_by_camera_and_row_by_row(seed, batch, views, grid):
     adapter, geometry = random_adapter(grid, views, seed), random_features(seed, batch, views, grid)

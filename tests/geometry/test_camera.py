@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, check_rigid, transform, unproject
@@ -14,7 +14,6 @@ from tests.geometry.scenes import calibrated, generator, project, random_pose, s
 sides = st.integers(2, 12)
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=seeds, height=sides, width=sides)
 def test_projecting_points_back_gives_the_pixels(seed, height, width):
     random = generator(seed)
@@ -27,7 +26,6 @@ def test_projecting_points_back_gives_the_pixels(seed, height, width):
     torch.testing.assert_close(distance, depth.flatten())
 
 
-@settings(max_examples=10, deadline=None)
 @given(seed=seeds)
 def test_intrinsics_and_poses_may_differ_within_a_batch(seed):
     random = generator(seed)
@@ -40,7 +38,6 @@ def test_intrinsics_and_poses_may_differ_within_a_batch(seed):
         torch.testing.assert_close(together[row : row + 1], alone)
 
 
-@settings(max_examples=15, deadline=None)
 @given(seed=seeds)
 def test_transforms_invert_compose_and_keep_distances(seed):
     random = generator(seed)
@@ -52,7 +49,6 @@ def test_transforms_invert_compose_and_keep_distances(seed):
     torch.testing.assert_close(torch.cdist(moved, moved), torch.cdist(flat, flat))
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=seeds, height=sides, width=sides, new_height=sides, new_width=sides)
 def test_resizing_leaves_every_ray_where_it_was(seed, height, width, new_height, new_width):
     camera = calibrated(height, width, focal=float(uniform(generator(seed), 0.5, 2.0, 1)))
@@ -80,7 +76,6 @@ def test_intrinsics_hold_at_their_own_size():
     assert camera.scaled_intrinsics(12, 18) == pytest.approx(camera.intrinsics)
 
 
-@settings(max_examples=15, deadline=None)
 @given(seed=seeds)
 def test_rigid_poses_pass_in_the_precision_they_come_in(seed):
     pose = random_pose(generator(seed), reach=3.0)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_policy_pi05_geometry.geometry.depth import check_measured, check_unit, to_metres
@@ -21,7 +21,6 @@ def random_millimetres(seed: int, batch: int, height: int, width: int) -> torch.
     return millimetres.where(torch.rand(millimetres.shape, generator=generator(seed)) > 0.1, 0)
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=seeds, batch=st.integers(1, 3), height=sides, width=sides)
 def test_layouts_and_dtypes_agree(seed, batch, height, width):
     millimetres = random_millimetres(seed, batch, height, width)
@@ -36,7 +35,6 @@ def test_layouts_and_dtypes_agree(seed, batch, height, width):
             assert torch.equal(valid, expected_valid)
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=seeds, batch=st.integers(1, 3), height=sides, width=sides)
 def test_millimetres_and_metres_agree(seed, batch, height, width):
     millimetres = random_millimetres(seed, batch, height, width)
@@ -53,7 +51,6 @@ def test_far_uint16_is_far_and_not_negative():
     torch.testing.assert_close(metres, torch.full((1, 1, 4, 4), 60.0))
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=seeds, bad=st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -0.5, 4.01]))
 def test_what_was_not_measured_is_zero_and_not_valid(seed, bad):
     random = generator(seed)
@@ -91,7 +88,6 @@ def test_a_frame_that_is_all_nan_is_named():
     check_measured(torch.zeros(3, 4, 5, dtype=torch.uint16), KEY)
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=seeds, median=st.floats(0.05, 10.0))
 def test_a_wrong_unit_is_an_error_in_both_directions(seed, median):
     metres = median * (0.8 + 0.4 * torch.rand(2, 1, 6, 7, generator=generator(seed)))

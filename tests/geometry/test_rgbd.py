@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
@@ -41,7 +41,6 @@ def brute_force_cell(points: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     return torch.cat([mean, spread, valid.double().mean()[None], angles.sin(), angles.cos()])
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=seeds, grid=grids, rows=st.integers(1, 4), columns=st.integers(1, 4), share=st.floats(0.05, 1.0))
 def test_cells_equal_a_brute_force_loop(seed, grid, rows, columns, share):
     random = generator(seed)
@@ -82,7 +81,6 @@ def test_sides_need_not_be_multiples_of_the_grid(grid):
 # --- points -------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=20, deadline=None)
 @given(seed=seeds, grid=st.sampled_from([1, 3, 4]), height_of_plane=st.floats(-0.2, 0.3))
 def test_a_table_is_flat_in_the_base_frame_whatever_the_camera_pose(seed, grid, height_of_plane):
     random = generator(seed)
@@ -99,7 +97,6 @@ def test_a_table_is_flat_in_the_base_frame_whatever_the_camera_pose(seed, grid, 
     assert (in_camera[valid][:, 2] - height_of_plane).abs().min() > 0.1
 
 
-@settings(max_examples=20, deadline=None)
 @given(seed=seeds)
 def test_moving_the_camera_leaves_points_where_they_are_in_the_base_frame_only(seed):
     random = generator(seed)
@@ -123,7 +120,6 @@ def test_moving_the_camera_leaves_points_where_they_are_in_the_base_frame_only(s
     assert (means[False][0] - means[False][1]).norm() > 0.01
 
 
-@settings(max_examples=15, deadline=None)
 @given(seed=seeds, quarter_turns=st.integers(1, 3))
 def test_rolling_the_camera_moves_cells_and_not_their_points(seed, quarter_turns):
     """Turned about its optical axis by quarter turns, a camera sees the same pixels elsewhere: an exact comparison."""
@@ -143,7 +139,6 @@ def test_rolling_the_camera_moves_cells_and_not_their_points(seed, quarter_turns
     torch.testing.assert_close(after.features[0, 0], cells, atol=5e-3, rtol=0)
 
 
-@settings(max_examples=10, deadline=None)
 @given(seed=seeds)
 def test_a_coarser_depth_image_of_the_same_camera_gives_the_same_points(seed):
     random = generator(seed)
@@ -176,7 +171,6 @@ def test_units_and_layouts_agree():
 # --- what never gets in -------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=seeds, grid=st.sampled_from([1, 2, 6]), bad=st.sampled_from([math.nan, math.inf, -math.inf, -1.0, 10.5]))
 def test_what_was_not_measured_never_reaches_a_feature(seed, grid, bad):
     random = generator(seed)
@@ -206,7 +200,6 @@ def three_cameras(random: torch.Generator) -> dict[str, CameraCalibration]:
     return {name: calibrated(*size, random_pose(random)) for name, size in sizes.items()}
 
 
-@settings(max_examples=10, deadline=None)
 @given(seed=seeds, missing=st.sampled_from(["left", "wrist", "right"]))
 def test_a_missing_camera_is_masked_and_the_others_are_unchanged(seed, missing):
     random = generator(seed)
@@ -236,7 +229,6 @@ def test_no_camera_at_all_is_refused():
         source({"observation.state": torch.zeros(1, 4)})
 
 
-@settings(max_examples=10, deadline=None)
 @given(seed=seeds)
 def test_a_pose_in_the_frame_overrides_the_calibration(seed):
     random = generator(seed)

@@ -39,6 +39,7 @@ EVERY_GEOMETRY = [
     for time, positions, placement, expert in product(
         ("clean", "denoise"), ("sequential", "parallel"), ("segment", "prefix"), ("shared", "own")
     )
+    if (placement, expert) != ("prefix", "own")  # the VLM's own prefix has no use for an expert
 ]
 
 
@@ -251,7 +252,7 @@ def run_segments(network: PI05Pytorch, batch: Batch, cached: bool) -> tuple[list
     return inner(
         attention_mask=[None if pads[s] is None else segment_mask(s, pads, atts) for s in Segment],
         position_ids=segment_positions(pads, "sequential"),
-        past_key_values=inner.make_cache(suffix.shape[0], lengths, suffix) if cached else None,
+        past_key_values=inner.make_cache(suffix.shape[0], lengths, suffix.device) if cached else None,
         inputs_embeds=embeds,
         use_cache=cached,
         adarms_cond=[None, network.embed_time(torch.zeros(1)), cond],

@@ -23,8 +23,9 @@ def same(a: FlowDraw, b: FlowDraw) -> bool:
     return all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
 
 
-def all_differ(a: FlowDraw, b: FlowDraw) -> bool:
-    return not any((x == y).any() for x, y in zip(a, b, strict=True))
+def nothing_shared(a: FlowDraw, b: FlowDraw) -> bool:
+    """No number of one draw occurs anywhere in the other, so neither is a shifted copy."""
+    return not any(torch.isin(x, y).any() for x, y in zip(a, b, strict=True))
 
 
 @given(seeds, steps, indices)
@@ -40,12 +41,12 @@ def test_same_key_same_draw(seed: int, step: int, index: int) -> None:
 def test_another_key_another_draw(seed: int, step: int, index: int) -> None:
     """Neighbouring seeds, steps and indices share no number, and neither does a key with its entries exchanged."""
     first = draw(seed, step, [index])
-    assert all_differ(draw(seed + 1, step, [index]), first)
-    assert all_differ(draw(seed, step + 1, [index]), first)
-    assert all_differ(draw(seed, step, [index + 1]), first)
+    assert nothing_shared(draw(seed + 1, step, [index]), first)
+    assert nothing_shared(draw(seed, step + 1, [index]), first)
+    assert nothing_shared(draw(seed, step, [index + 1]), first)
     if len({seed, step, index}) == 3:
-        assert all_differ(draw(step, seed, [index]), first)
-        assert all_differ(draw(index, step, [seed]), first)
+        assert nothing_shared(draw(step, seed, [index]), first)
+        assert nothing_shared(draw(index, step, [seed]), first)
 
 
 @given(st.lists(indices, min_size=1, max_size=6, unique=True), st.randoms(use_true_random=False))
@@ -99,6 +100,16 @@ def test_noise_time_and_dropout_are_independent() -> None:
     columns = torch.stack([noise[:, 0, 0], noise[:, 1, 0], later[:, 0, 0], time, dropout])
     correlation = torch.corrcoef(columns) - torch.eye(len(columns))
     assert correlation.abs().max() < 0.06
+
+
+def test_several_flow_samples() -> None:
+    """K noises and times per observation, no two alike, and one dropout draw; keyed like a single one."""
+    noise, time, dropout = draw_flow(0, 0, [5, 6], SHAPE, **BETA, samples=3)
+    assert (noise.shape, time.shape, dropout.shape) == ((2, 3, 4, 3), (2, 3), (2,))
+    assert len(noise.unique()) == noise.numel()
+    assert len(time.unique()) == time.numel()
+    alone = draw_flow(0, 0, [6], SHAPE, **BETA, samples=3)
+    assert same(alone, FlowDraw(noise[1:], time[1:], dropout[1:]))
 
 
 def test_alpha_and_beta_are_used() -> None:

@@ -191,7 +191,7 @@ def test_a_list_of_two_is_plain_pi05() -> None:
 def test_use_cache_and_cache_come_together() -> None:
     """Either alone is a mistake of the caller."""
     inner = shared_network(SEGMENT).paligemma_with_expert
-    cache = inner.make_cache(1, [1, 1, 1], torch.zeros(1))
+    cache = inner.make_cache(1, [1, 1, 1], torch.device("cpu"))
     for use_cache, past in ((True, None), (False, cache)):
         with pytest.raises(ValueError, match="use_cache=True"):
             inner([None] * 3, [None] * 3, past, [None] * 3, use_cache)

@@ -167,6 +167,21 @@ def test_an_absent_camera_is_a_masked_one(geometry: GeometrySegmentConfig, absen
     assert_near(both_paths(network, batch), masked)
 
 
+@pytest.mark.parametrize("geometry", [None, SEGMENT, IN_PREFIX], ids=name_of)
+def test_a_row_without_a_prefix(geometry: GeometrySegmentConfig | None) -> None:
+    """Invariant 5: a row with every camera masked and an empty prompt has no prefix to look at, and stays finite."""
+    network = shared_network(geometry)
+    batch = Case(seed=15, batch=3, cameras=1).draw(network.geometry_width)
+    batch = batch.without_geometry if geometry is None else batch
+    batch.masks[0] = False
+    batch.img_masks[0][0] = False
+    dirty = batch._replace(images=[-batch.images[0]])
+    dirty.images[0][1:] = batch.images[0][1:]
+    found = both_paths(network, batch)
+    assert all(entry.isfinite().all() for entry in found)
+    assert all(torch.equal(a, b) for a, b in zip(both_paths(network, dirty), found, strict=True))
+
+
 def test_a_hole_is_no_token() -> None:
     """Under sequential positions, cells that are holes in every row may be left out."""
     network = shared_network(SEGMENT)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lerobot_policy_pi05_geometry.model import PI05Pytorch, SegmentKVCache
+from lerobot_policy_pi05_geometry.model import PI05Pytorch
 from lerobot_policy_pi05_geometry.model.gate import GeometryGate
 from lerobot_policy_pi05_geometry.model.gemma import AdaRMSNorm, RMSNorm
 from lerobot_policy_pi05_geometry.model.precision import Float32Linear, Float32Module, compute_in
@@ -16,7 +16,6 @@ from .helpers import (
     Batch,
     Case,
     build_network,
-    distance,
     name_of,
     recorded_caches,
     recorded_outputs,
@@ -163,12 +162,3 @@ def test_training_in_bf16_reaches_float32_gradients() -> None:
     assert {gradient.dtype for gradient in found.values()} == {torch.float32}
     together = [torch.cat([gradients[name].flatten() for name in expected]) for gradients in (found, expected)]
     assert relative(*together) < BF16_TOLERANCE
-
-
-def test_cache_in_the_compute_dtype() -> None:
-    """Storage in bf16 with float32 compute keeps a float32 cache."""
-    network = build_network(SEGMENT, dtype=torch.float32)
-    cache = network.paligemma_with_expert.make_cache(1, [2, 2, 2], torch.zeros(1, dtype=BF16))
-    assert isinstance(cache, SegmentKVCache)
-    assert cache.keys.dtype == torch.float32
-    assert distance(cache.keys, torch.zeros_like(cache.keys)) == 0

@@ -1,0 +1,203 @@
+"""Prefix, denoising step and whole chunk: ours with geometry, ours without, and LeRobot's π0.5, side by side.
+
+    python -m benchmarks.network                    small size, float32
+    python -m benchmarks.network --full             released size, bfloat16, random weights (needs about 20 GB)
+
+All three run the same weights and inputs in one process, in turn, round by round; a ratio is the median over rounds of
+ours / LeRobot's in the same round. Peak memory is that of a process that builds one of them and predicts one chunk.
+Prompts have the length that the batch needs; LeRobot always pads them to 200.
+"""
+
+import argparse
+import json
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from benchmarks.lerobot_pi05 import build_lerobot_pi05, copy_weights
+from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, NetworkConfig, PI05Pytorch
+from lerobot_policy_pi05_geometry.model.precision import compute_in
+from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
+
+ARMS = ("geometry", "no geometry", "lerobot")
+PARTS = ("prefix", "denoise step", "chunk")
+PROMPT = 48  # tokens of a typical prompt with 32 state numbers would be some 120; a short one is where padding costs most
+
+
+@contextmanager
+def default_dtype(dtype: torch.dtype) -> Iterator[None]:
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+def build(arm: str, args: argparse.Namespace, weights: torch.nn.Module | None = None):
+    """One arm's network; `weights` is LeRobot's, to copy from."""
+    vlm, expert = ("gemma_2b", "gemma_300m") if args.full else ("small", "small")
+    size, dtype = (224, torch.bfloat16) if args.full else (84, torch.float32)
+    torch.manual_seed(0)
+    if arm == "lerobot":
+        with default_dtype(dtype):
+            return build_lerobot_pi05(
+                vlm, expert, image_size=size, chunk_size=args.chunk, max_action_dim=32,
+                dtype="bfloat16" if args.full else "float32",
+            ).eval()  # fmt: skip
+    config = NetworkConfig(
+        PALIGEMMA_VARIANTS[vlm], EXPERT_VARIANTS[expert], size, args.chunk, 32, dtype=dtype, param_dtype=dtype,
+        geometry=GeometrySegmentConfig(),
+    )  # fmt: skip
+    with default_dtype(dtype):
+        network = PI05Pytorch(config)
+    for module in network.modules():  # what is stored in float32 was built in the default dtype
+        if module.__class__.__name__ in ("Float32Linear", "RMSNorm", "GeometryGate"):
+            module.float()
+    if weights is not None:
+        copy_weights(weights, network)
+    return network.eval()
+
+
+def inputs(args: argparse.Namespace, tokens: int) -> dict:
+    """The same observation for everyone; LeRobot's has more padding."""
+    generator = torch.Generator().manual_seed(1)
+    size = 224 if args.full else 84
+    text = torch.zeros(1, tokens, dtype=torch.long)
+    text[:, :PROMPT] = torch.randint(3, 1000, (1, PROMPT), generator=generator)
+    mask = torch.arange(tokens)[None] < PROMPT
+    return {
+        "images": [torch.rand(1, 3, size, size, generator=generator) * 2 - 1 for _ in range(args.cameras)],
+        "img_masks": [torch.ones(1, dtype=torch.bool)] * args.cameras,
+        "tokens": text,
+        "masks": mask,
+        "noise": torch.randn(1, args.chunk, 32, generator=generator),
+    }
+
+
+def parts(arm: str, network, args: argparse.Namespace) -> dict[str, Callable[[], Tensor]]:
+    """What is timed, as functions without arguments."""
+    batch = inputs(args, 200 if arm == "lerobot" else PROMPT)
+    noise = batch.pop("noise")
+    observation = (batch["images"], batch["img_masks"], batch["tokens"], batch["masks"])
+    now = torch.full((1,), 0.5)
+    if arm == "lerobot":
+
+        def prefix():
+            from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attention_masks_4d
+
+            embs, pad, att = network.embed_prefix(*observation)
+            mask = prepare_attention_masks_4d(make_att_2d_masks(pad, att))
+            network.paligemma_with_expert.paligemma.model.language_model.config._attn_implementation = "eager"
+            _, cache = network.paligemma_with_expert.forward(
+                attention_mask=mask,
+                position_ids=torch.cumsum(pad, dim=1) - 1,
+                inputs_embeds=[embs, None],
+                use_cache=True,
+            )
+            return pad, cache
+
+        pad, cache = prefix()
+        return {
+            "prefix": prefix,
+            "denoise step": lambda: network.denoise_step(pad, cache, noise, now),
+            "chunk": lambda: network.sample_actions(*observation, noise=noise),
+        }
+    tokens = None
+    if arm == "geometry":
+        tokens = torch.randn(1, args.geometry_tokens, network.geometry_width, generator=torch.Generator().manual_seed(2))
+
+    def context():
+        with compute_in(network.config.dtype, noise.device):
+            before, geometry = network._context(*observation, tokens, None, None)
+            return before, geometry, network._prefill(before, geometry, args.chunk)
+
+    before, geometry, cache = context()
+    return {
+        "prefix": context,
+        "denoise step": lambda: network.denoise_step(before.pad, cache, noise, now, geometry),
+        "chunk": lambda: network.sample_actions(*observation, noise=noise, geom_embs=tokens),
+    }
+
+
+@torch.no_grad()
+def times(args: argparse.Namespace) -> dict[str, dict[str, list[float]]]:
+    """Seconds per arm, part and round."""
+    lerobot = build("lerobot", args)
+    ours = build("geometry", args, lerobot)
+    functions = {arm: parts(arm, lerobot if arm == "lerobot" else ours, args) for arm in ARMS}
+    result: dict[str, dict[str, list[float]]] = {arm: {part: [] for part in PARTS} for arm in ARMS}
+    for round_index in range(args.rounds + 1):
+        for part in PARTS:
+            for arm in ARMS:
+                start = time.perf_counter()
+                for _ in range(args.repeat if part != "chunk" else 1):
+                    functions[arm][part]()
+                seconds = (time.perf_counter() - start) / (args.repeat if part != "chunk" else 1)
+                if round_index:  # the first round warms up
+                    result[arm][part].append(seconds)
+    return result
+
+
+@torch.no_grad()
+def peak_memory(arm: str, args: argparse.Namespace) -> float:
+    """GiB that this process needs above what it held before, for building one arm and one chunk."""
+    before = high_water_mark()
+    parts(arm, build(arm, args), args)["chunk"]()
+    return high_water_mark() - before
+
+
+def high_water_mark() -> float:
+    """Largest resident set of this process so far, GiB (Linux; unlike ru_maxrss it does not inherit the parent's)."""
+    with open("/proc/self/status") as file:
+        return next(int(line.split()[1]) / 2**20 for line in file if line.startswith("VmHWM"))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help="released size in bfloat16")
+    parser.add_argument("--cameras", type=int, default=1)
+    parser.add_argument("--chunk", type=int, default=50, help="action steps")
+    parser.add_argument("--geometry-tokens", type=int, default=64)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--repeat", type=int, default=3, help="prefixes and steps per round")
+    parser.add_argument("--output", help="write the numbers to this JSON file")
+    parser.add_argument("--memory-of", choices=ARMS, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.memory_of:
+        print(json.dumps(peak_memory(args.memory_of, args)))
+        return
+
+    measured = times(args)
+    memory = {}
+    for arm in ARMS:
+        command = [sys.executable, "-m", "benchmarks.network", *sys.argv[1:], "--memory-of", arm]
+        memory[arm] = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+
+    print(f"{'':14}" + "".join(f"{part + ' ms':>16}{'ratio':>8}" for part in PARTS) + f"{'peak GiB':>12}{'ratio':>8}")
+    summary: dict = {"machine": f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"}
+    summary["settings"] = {k: v for k, v in vars(args).items() if k not in ("memory_of", "output")}
+    for arm in ARMS:
+        row = {}
+        line = f"{arm:14}"
+        for part in PARTS:
+            ratios = [a / b for a, b in zip(measured[arm][part], measured["lerobot"][part], strict=True)]
+            row[part] = {"ms": 1e3 * statistics.median(measured[arm][part]), "ratio": statistics.median(ratios)}
+            line += f"{row[part]['ms']:16.1f}{row[part]['ratio']:8.2f}"
+        row["peak"] = {"GiB": memory[arm], "ratio": memory[arm] / memory["lerobot"]}
+        print(line + f"{memory[arm]:12.2f}{row['peak']['ratio']:8.2f}")
+        summary[arm] = row
+    if args.output:
+        with open(args.output, "w") as file:
+            json.dump(summary, file, indent=2)
+
+
+if __name__ == "__main__":
+    main()

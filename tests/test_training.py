@@ -1,0 +1,146 @@
+"""LeRobot's own commands on a recorded dataset: train, stop, resume, evaluate. Each is a process of its own."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from lerobot_policy_pi05_geometry.sim.record import record
+
+pytestmark = [pytest.mark.train, pytest.mark.sim]
+
+SIZE = 28
+
+
+def lerobot(command: str, *arguments: str) -> str:
+    """Run `lerobot-train` or `lerobot-eval` without a hub; returns what it logged."""
+    result = subprocess.run(
+        [sys.executable, "-m", f"lerobot.scripts.lerobot_{command}", *arguments],
+        env=os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "MUJOCO_GL": "egl"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    return result.stderr + result.stdout
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    """Four short expert episodes."""
+    root = tmp_path_factory.mktemp("data") / "tiny"
+    list(record(root, "local/tiny", "button-press-topdown-wide", episodes=4, image_size=SIZE))
+    return root
+
+
+@pytest.fixture(scope="module")
+def trained(dataset, tmp_path_factory) -> tuple[Path, str]:
+    """The output folder of 6 uninterrupted steps, saved after 3 and 6, and the log."""
+    output = tmp_path_factory.mktemp("train") / "run"
+    log = lerobot(
+        "train",
+        "--policy.type=pi05_geometry",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--policy.paligemma_variant=tiny",
+        "--policy.action_expert_variant=tiny",
+        f"--policy.image_resolution=[{SIZE},{SIZE}]",
+        "--policy.geometry_grid=4",
+        "--policy.chunk_size=6",
+        "--policy.n_action_steps=3",
+        "--policy.num_inference_steps=2",
+        "--policy.max_action_dim=4",
+        "--policy.optimizer_lr=1e-3",
+        "--policy.scheduler_warmup_steps=2",
+        "--dataset.repo_id=local/tiny",
+        f"--dataset.root={dataset}",
+        "--dataset.eval_split=0.25",
+        "--eval_steps=3",
+        "--max_eval_samples=4",
+        f"--output_dir={output}",
+        "--steps=6",
+        "--save_freq=3",
+        "--log_freq=1",
+        "--batch_size=4",
+        "--num_workers=0",
+        "--wandb.enable=false",
+    )
+    return output, log
+
+
+def tensors(folder: Path) -> dict[str, torch.Tensor]:
+    """Every tensor that a checkpoint holds, by file and name."""
+    found = {}
+    for path in sorted(folder.rglob("*.safetensors")):
+        found.update({f"{path.relative_to(folder)}:{name}": tensor for name, tensor in load_file(path).items()})
+    return found
+
+
+def test_training_moves_every_trainable_weight_and_counts_its_steps(trained):
+    checkpoints = trained[0] / "checkpoints"
+    before = load_file(checkpoints / "000003" / "pretrained_model" / "model.safetensors")
+    after = load_file(checkpoints / "000006" / "pretrained_model" / "model.safetensors")
+    assert (before["training_step"], after["training_step"]) == (3, 6)
+    for name in ("model.action_in_proj.weight", "geometry.adapter.fc_in.weight"):
+        assert not torch.equal(before[name], after[name]), name
+    assert all(tensor.isfinite().all() for tensor in after.values())
+
+
+def test_the_held_out_loss_is_logged(trained):
+    assert trained[1].count("eval_loss") >= 2
+
+
+def test_the_checkpoint_is_complete(trained):
+    """Calibration, depth keys and tokenizer are inside; neither the dataset nor a hub is needed."""
+    folder = trained[0] / "checkpoints" / "last" / "pretrained_model"
+    config = json.loads((folder / "config.json").read_text())
+    assert config["calibration"]["front"]["size"] == [SIZE, SIZE]
+    assert set(config["geometry_features"]) == {
+        "observation.images.front_depth",
+        "observation.calibration.front.extrinsics",
+    }
+    assert "observation.images.front_depth" not in config["input_features"]
+    assert list(folder.glob("*pi05_geometry_tokenizer.safetensors"))
+
+
+def test_resuming_equals_never_having_stopped_bit_for_bit(trained, tmp_path):
+    checkpoints = trained[0] / "checkpoints"
+    shutil.move(checkpoints / "000006", tmp_path / "uninterrupted")
+    (checkpoints / "last").unlink()
+    config = checkpoints / "000003" / "pretrained_model" / "train_config.json"
+    lerobot("train", f"--config_path={config}", "--resume=true")
+    expected, found = tensors(tmp_path / "uninterrupted"), tensors(checkpoints / "000006")
+    assert any("optimizer_state" in name for name in expected)
+    assert found.keys() == expected.keys()
+    for name, tensor in expected.items():
+        assert torch.equal(found[name], tensor), name
+    for name in ("scheduler_state.json", "optimizer_param_groups.json", "training_step.json"):
+        state = Path("training_state") / name
+        resumed, uninterrupted = (
+            json.loads((root / state).read_text()) for root in (checkpoints / "000006", tmp_path / "uninterrupted")
+        )
+        assert resumed == uninterrupted, name
+
+
+def test_a_checkpoint_is_evaluated_in_the_environment(trained, tmp_path):
+    moved = shutil.copytree(trained[0] / "checkpoints" / "000003" / "pretrained_model", tmp_path / "moved")
+    lerobot(
+        "eval",
+        f"--policy.path={moved}",
+        "--policy.device=cpu",
+        "--env.type=metaworld_rgbd",
+        f"--env.image_size={SIZE}",
+        "--env.episode_length=3",
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        f"--output_dir={tmp_path / 'evaluation'}",
+    )
+    info = json.loads((tmp_path / "evaluation" / "eval_info.json").read_text())
+    assert info["overall"]["n_episodes"] == 2
+    assert info["overall"]["pc_success"] in (0.0, 50.0, 100.0)
