@@ -482,16 +482,23 @@ def test_random_tokens_take_as_much_room_and_look_at_nothing():
     policy.train().forward(batch)[0].backward()
 
 
-@pytest.mark.parametrize("source", ["none", "random"])
-def test_a_blind_policy_trains_and_acts(source):
+def test_a_blind_policy_trains_and_acts():
     _, outputs = make_features()
     inputs = {STATE: PolicyFeature(FeatureType.STATE, (7,))}
-    policy = make_policy(input_features=inputs, output_features=outputs, geometry_source=source).train()
+    policy = make_policy(input_features=inputs, output_features=outputs, geometry_source="none").train()
     batch = without(make_batch(), FRONT, WRIST, *GEOMETRY)
     policy.forward(batch)[0].backward()
     for name, parameter in policy.named_parameters():
         assert (parameter.grad is not None) == parameter.requires_grad, name
     assert chunk_of(policy, batch).shape == (2, CHUNK, ACTION_DIM)
+
+
+def test_random_tokens_of_no_camera_are_refused():
+    """They would be no tokens, and the gate would wait for a gradient that never comes."""
+    _, outputs = make_features()
+    inputs = {STATE: PolicyFeature(FeatureType.STATE, (7,))}
+    with pytest.raises(ValueError, match="geometry_source=random"):
+        make_policy(input_features=inputs, output_features=outputs, geometry_source="random")
 
 
 def test_depth_cameras_need_depth_in_the_data():

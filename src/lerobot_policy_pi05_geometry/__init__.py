@@ -9,12 +9,19 @@
    model                                     the network
 ```
 
-Imports run downwards only. Importing this package registers the policy type `pi05_geometry` and the environment type
-`metaworld_rgbd` with LeRobot, which imports it by itself because of its name.
+Imports run downwards only. Importing this package registers the policy type `pi05_geometry`, its processor steps and the
+environment type `metaworld_rgbd` with LeRobot, which imports it by itself because of its name.
 """
 
 from .configuration_pi05_geometry import PI05GeometryConfig
+from .prompt import PortableTokenizerProcessorStep, PromptProcessorStep
 from .sim.configuration import MetaworldRgbdEnv
 
 __version__ = "0.1.0"
-__all__ = ["MetaworldRgbdEnv", "PI05GeometryConfig", "__version__"]
+__all__ = [
+    "MetaworldRgbdEnv",
+    "PI05GeometryConfig",
+    "PortableTokenizerProcessorStep",
+    "PromptProcessorStep",
+    "__version__",
+]

@@ -4,10 +4,12 @@ import logging
 import os
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Annotated
 
 os.environ.setdefault("TQDM_DISABLE", "1")  # LeRobot's bars would draw over ours
+os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
 
 import typer
@@ -159,6 +161,8 @@ def main() -> None:
     )
     for noisy in ("lerobot.utils.import_utils", "datasets", "httpx"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", module="metaworld")
+    warnings.filterwarnings("ignore", module="gymnasium")
     try:
         app()
     except (ValueError, FileNotFoundError, FileExistsError, ModuleNotFoundError, RuntimeError, OSError) as error:

@@ -67,7 +67,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self.register_buffer("training_step", torch.zeros((), dtype=torch.int64))
         self._noise_seed = torch.initial_seed()
         self._last_update: dict[str, Tensor] = {}
-        self.to(config.device)
+        if not self.model.action_in_proj.weight.is_meta:  # from_pretrained fills the weights first
+            self.to(config.device)
         self.reset()
 
     def _build_source(self, dataset_meta: Any | None) -> GeometrySource | None:
@@ -137,12 +138,10 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         weights = find_file(pretrained_name_or_path, SAFETENSORS_SINGLE_FILE, **hub)
         if config is None:
             config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, **hub)
-        device, config.device = config.device, "cpu"
         with init_empty_weights(include_buffers=False):
             policy = cls(config, **kwargs)
         load_strictly(policy, weights)
-        config.device = device
-        policy.to(device)
+        policy.to(config.device)
         policy.eval()
         return policy
 

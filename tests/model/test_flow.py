@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from lerobot_policy_pi05_geometry.model.flow import FlowDraw, draw_flow
@@ -10,7 +10,7 @@ from lerobot_policy_pi05_geometry.model.flow import FlowDraw, draw_flow
 SHAPE = (4, 3)
 BETA = {"alpha": 1.5, "beta": 1.0, "scale": 0.999, "offset": 0.001}
 
-seeds = st.integers(0, 2**63)
+seeds = st.integers(0, 2**64 - 2)
 steps = st.integers(-1, 2**40)
 indices = st.integers(-1, 2**40)
 
@@ -37,7 +37,9 @@ def test_same_key_same_draw(seed: int, step: int, index: int) -> None:
     assert same(draw(seed, step, [index]), first)
 
 
-@given(seeds, steps, indices)
+@given(seed=seeds, step=steps, index=indices)
+@example(seed=3, step=-1, index=2)  # -1 is the step of evaluation
+@example(seed=2**63, step=4, index=5)  # torch's seeds have 64 bits
 def test_another_key_another_draw(seed: int, step: int, index: int) -> None:
     """Neighbouring seeds, steps and indices share no number, and neither does a key with its entries exchanged."""
     first = draw(seed, step, [index])
