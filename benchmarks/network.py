@@ -28,7 +28,9 @@ from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEM
 
 ARMS = ("geometry", "no geometry", "lerobot")
 PARTS = ("prefix", "denoise step", "chunk")
-PROMPT = 48  # tokens of a typical prompt with 32 state numbers would be some 120; a short one is where padding costs most
+PROMPT = (
+    48  # tokens of a typical prompt with 32 state numbers would be some 120; a short one is where padding costs most
+)
 
 
 @contextmanager
@@ -112,7 +114,9 @@ def parts(arm: str, network, args: argparse.Namespace) -> dict[str, Callable[[],
         }
     tokens = None
     if arm == "geometry":
-        tokens = torch.randn(1, args.geometry_tokens, network.geometry_width, generator=torch.Generator().manual_seed(2))
+        tokens = torch.randn(
+            1, args.geometry_tokens, network.geometry_width, generator=torch.Generator().manual_seed(2)
+        )
 
     def context():
         with compute_in(network.config.dtype, noise.device):
@@ -179,7 +183,9 @@ def main() -> None:
     memory = {}
     for arm in ARMS:
         command = [sys.executable, "-m", "benchmarks.network", *sys.argv[1:], "--memory-of", arm]
-        memory[arm] = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+        memory[arm] = json.loads(
+            subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1]
+        )
 
     print(f"{'':14}" + "".join(f"{part + ' ms':>16}{'ratio':>8}" for part in PARTS) + f"{'peak GiB':>12}{'ratio':>8}")
     summary: dict = {"machine": f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"}

@@ -15,6 +15,7 @@ FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 FRONT_DEPTH, WRIST_DEPTH = f"{FRONT}_depth", f"{WRIST}_depth"
 WRIST_POSE = "observation.calibration.wrist.extrinsics"
 STATE, TOKENS, TOKEN_MASK = "observation.state", "observation.language.tokens", "observation.language.attention_mask"
+GEOMETRY = (FRONT_DEPTH, WRIST_DEPTH, WRIST_POSE)
 STATE_DIM, ACTION_DIM, CHUNK = 7, 5, 6
 
 
@@ -121,3 +122,15 @@ def make_processors(config: PI05GeometryConfig):
     """Pre- and postprocessor of a configuration whose features were validated, as LeRobot does it: policy first."""
     config.validate_features()
     return make_pi05_geometry_pre_post_processors(config, make_stats())
+
+
+def without(batch: dict[str, Any], *keys: str) -> dict[str, Any]:
+    return {key: value for key, value in batch.items() if key not in keys}
+
+
+def chunk_of(policy: PI05GeometryPolicy, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+    """An action chunk at the start of an episode, from noise that is always the same."""
+    config, random = policy.config, torch.Generator().manual_seed(9)
+    noise = torch.randn(len(batch[TOKENS]), config.chunk_size, config.max_action_dim, generator=random)
+    policy.reset()
+    return policy.predict_action_chunk(batch, noise=noise, **kwargs)

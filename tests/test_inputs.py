@@ -166,7 +166,8 @@ def test_a_file_that_is_not_there_is_an_error_and_not_the_next_choice(dataset):
         resolve_calibration(make_config(calibration_path="nowhere.json"), dataset)
 
 
-def test_the_policy_takes_the_datasets_calibration(dataset):
-    policy = PI05GeometryPolicy(make_config(calibration={}), dataset_meta=dataset)
+@pytest.mark.parametrize("recorded", [{}, calibration_with_focal_length(30.0)], ids=["none", "another"])
+def test_the_policy_takes_the_datasets_calibration(dataset, recorded):
+    policy = PI05GeometryPolicy(make_config(calibration=recorded), dataset_meta=dataset)
     assert policy.geometry.source.calibration == calibration_with_focal_length(20.0)
     assert policy.config.calibration == calibration_with_focal_length(20.0)

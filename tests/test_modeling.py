@@ -1,30 +1,20 @@
-"""The policy as LeRobot uses it: training, acting, saving, and what it refuses."""
+"""The policy in training and on disk: losses, noise, parameter groups, checkpoints, and what it refuses."""
 
 import copy
-import math
 
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature, RTCAttentionSchedule
-from lerobot.policies.common.flow_matching import euler_integrate
-from lerobot.policies.rtc.configuration_rtc import RTCConfig
-from lerobot.policies.rtc.modeling_rtc import RTCProcessor
-from lerobot.processor import PolicyProcessorPipeline
+from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_policy_pi05_geometry.inputs import prepare_images
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
-from lerobot_policy_pi05_geometry.processor_pi05_geometry import make_pi05_geometry_pre_post_processors
 from tests.doors import (
     ACTION_DIM,
     CHUNK,
     FRONT,
-    FRONT_DEPTH,
+    GEOMETRY,
     STATE,
-    TOKEN_MASK,
-    TOKENS,
     WRIST,
-    WRIST_DEPTH,
-    WRIST_POSE,
+    chunk_of,
     make_batch,
     make_calibration,
     make_config,
@@ -33,24 +23,8 @@ from tests.doors import (
     make_policy,
     make_processors,
     redraw,
+    without,
 )
-
-GEOMETRY = (FRONT_DEPTH, WRIST_DEPTH, WRIST_POSE)
-
-
-def without(batch: dict, *keys: str) -> dict:
-    return {key: value for key, value in batch.items() if key not in keys}
-
-
-def chunk_of(policy: PI05GeometryPolicy, batch: dict, **kwargs) -> torch.Tensor:
-    """An action chunk from noise that is always the same."""
-    config = policy.config
-    noise = torch.randn(
-        batch[TOKENS].shape[0], config.chunk_size, config.max_action_dim, generator=torch.Generator().manual_seed(9)
-    )
-    policy.reset()
-    return policy.predict_action_chunk(batch, noise=noise, **kwargs)
-
 
 # --- loss ---------------------------------------------------------------------------------------------------------
 
@@ -257,71 +231,6 @@ def test_an_optimiser_step_is_counted_and_measured():
     assert "geometry_update" in infos[2]
 
 
-# --- acting -------------------------------------------------------------------------------------------------------
-
-
-def test_a_chunk_has_the_shape_of_the_action_and_follows_its_noise():
-    policy, batch = make_policy(), make_batch(3)
-    chunk = chunk_of(policy, batch)
-    assert chunk.shape == (3, CHUNK, ACTION_DIM)
-    assert torch.equal(chunk_of(policy, batch), chunk)
-    assert not torch.allclose(policy.predict_action_chunk(batch, noise=torch.zeros(3, CHUNK, 8)), chunk)
-    assert not torch.allclose(chunk_of(policy, batch, num_steps=7), chunk)
-    torch.manual_seed(3)
-    drawn = policy.predict_action_chunk(batch)
-    assert not torch.allclose(policy.predict_action_chunk(batch), drawn)
-    torch.manual_seed(3)
-    assert torch.equal(policy.predict_action_chunk(batch), drawn)
-
-
-def test_actions_leave_the_queue_one_by_one_until_it_is_empty():
-    policy, batch = make_policy(n_action_steps=4), make_batch(2)
-    noise = torch.randn(2, CHUNK, 8)
-    chunk = policy.predict_action_chunk(batch, noise=noise)
-    policy.reset()
-    for step in range(4):
-        assert torch.equal(policy.select_action(batch, noise=noise), chunk[:, step])
-    other = make_batch(2, seed=5)
-    assert torch.equal(policy.select_action(other, noise=noise), policy.predict_action_chunk(other, noise=noise)[:, 0])
-
-
-def test_reset_forgets_the_queue():
-    policy, batch, noise = make_policy(), make_batch(2), torch.randn(2, CHUNK, 8)
-    first = policy.select_action(batch, noise=noise)
-    policy.reset()
-    assert torch.equal(policy.select_action(batch, noise=noise), first)
-    policy.reset()
-    other = make_batch(2, seed=5)
-    assert torch.equal(policy.select_action(other, noise=noise), policy.predict_action_chunk(other, noise=noise)[:, 0])
-
-
-def test_acting_builds_no_graph_and_leaves_training_mode():
-    policy = make_policy().train()
-    assert not policy.select_action(make_batch()).requires_grad
-    assert not policy.training
-    assert not policy.predict_action_chunk(make_batch()).requires_grad
-
-
-def test_geometry_matters():
-    policy, batch = make_policy(), make_batch()
-    for key in GEOMETRY:
-        changed = batch | {key: make_batch(seed=7)[key]}
-        assert (chunk_of(policy, changed) - chunk_of(policy, batch)).abs().max() > 1e-4, key
-
-
-def test_a_depth_camera_may_fail_in_the_middle_of_an_episode(caplog):
-    policy, batch = make_policy(n_action_steps=1), make_batch(1)
-    policy.reset()
-    policy.select_action(batch)
-    for broken in (without(batch, FRONT_DEPTH), batch | {FRONT_DEPTH: torch.full_like(batch[FRONT_DEPTH], math.nan)}):
-        assert policy.select_action(broken).isfinite().all()
-    assert policy.select_action(without(batch, FRONT_DEPTH, WRIST_DEPTH)).isfinite().all()
-    assert sum("'front'" in record.getMessage() for record in caplog.records) == 1
-    noise = torch.zeros(1, CHUNK, 8)
-    recovered = policy.predict_action_chunk(batch, noise=noise)
-    assert torch.equal(recovered, make_policy(n_action_steps=1).predict_action_chunk(batch, noise=noise))
-
-
 # --- saving -------------------------------------------------------------------------------------------------------
 
 
@@ -518,185 +427,3 @@ def test_depth_cameras_need_intrinsics():
     calibration["wrist"].intrinsics[0] = 0.0
     with pytest.raises(ValueError, match=r"Intrinsics of camera 'wrist' are singular"):
         make_policy(calibration=calibration)
-
-
-# --- nothing leaks ------------------------------------------------------------------------------------------------
-
-
-def other_geometry(batch: dict) -> dict:
-    """The same batch with other depth and another pose."""
-    return batch | {key: make_observation(seed=7)[key] for key in GEOMETRY}
-
-
-def test_geometry_reaches_neither_the_prompt_nor_siglip_nor_the_normaliser():
-    config = make_config()
-    preprocessor, _ = make_processors(config)
-    policy = redraw(PI05GeometryPolicy(config)).eval()
-    seen = []
-    tower = policy.model.paligemma_with_expert.paligemma.model.vision_tower
-    tower.register_forward_hook(
-        lambda _m, args, kwargs, _o: seen.append(args[0] if args else kwargs["pixel_values"]), with_kwargs=True
-    )
-    raw = make_observation()
-    outputs = []
-    for observation in (raw, other_geometry(raw)):
-        processed = preprocessor(dict(observation))
-        for key in GEOMETRY:
-            assert torch.equal(processed[key], observation[key]), key
-        policy.predict_action_chunk(processed)
-        outputs.append(processed)
-    for key, value in without(outputs[0], *GEOMETRY).items():
-        other = outputs[1][key]
-        assert torch.equal(value, other) if isinstance(value, torch.Tensor) else value == other, key
-    assert len(seen) == 2
-    assert torch.equal(seen[0], seen[1])
-    assert seen[0].shape == (4, 3, 28, 28)  # two RGB cameras, a batch of two
-
-
-def test_the_normaliser_does_not_know_geometry():
-    """Statistics of depth and poses are in every dataset; they must not be applied."""
-    config = make_config()
-    preprocessor, _ = make_processors(config)
-    (normaliser,) = (step for step in preprocessor.steps if hasattr(step, "norm_map"))
-    assert set(normaliser.features) == {FRONT, WRIST, STATE, "action"}
-
-
-def test_processors_may_be_made_before_the_policy():
-    """Whatever is made first, depth and poses come through untouched."""
-    spread = {"q01": -torch.ones(4, 4), "q99": 3 * torch.ones(4, 4)}
-    preprocessor, _ = make_pi05_geometry_pre_post_processors(make_config(), {WRIST_POSE: spread})
-    observation = make_observation()
-    assert torch.equal(preprocessor(dict(observation))[WRIST_POSE], observation[WRIST_POSE])
-
-
-# --- processors ---------------------------------------------------------------------------------------------------
-
-
-def test_actions_survive_normalising_and_back():
-    preprocessor, postprocessor = make_processors(make_config())
-    action = torch.randn(2, CHUNK, ACTION_DIM)
-    processed = preprocessor(make_observation() | {"action": action})
-    assert not torch.allclose(processed["action"], action)
-    torch.testing.assert_close(postprocessor(processed["action"]), action)
-
-
-@pytest.mark.parametrize("excluded", [[], ["gripper"]])
-def test_relative_actions_survive_the_way_there_and_back(excluded):
-    names = ["x", "y", "z", "turn", "gripper"]
-    config = make_config(use_relative_actions=True, relative_exclude_joints=excluded, action_feature_names=names)
-    preprocessor, postprocessor = make_processors(config)
-    absolute = make_processors(make_config())[0]
-    observation, action = make_observation(), torch.randn(2, CHUNK, ACTION_DIM)
-    state = observation[STATE]
-    processed = preprocessor(observation | {"action": action})
-    offset = state[:, None, :ACTION_DIM].clone()
-    offset[..., ACTION_DIM - len(excluded) :] = 0.0
-    expected = absolute(observation | {"action": action - offset})["action"]
-    torch.testing.assert_close(processed["action"], expected)
-    torch.testing.assert_close(postprocessor(processed["action"]), action)
-
-
-def test_keys_can_be_renamed_depth_included(tmp_path):
-    config = make_config()
-    preprocessor, _ = make_processors(config)
-    preprocessor.save_pretrained(tmp_path)
-    names = {FRONT: "observation.images.top", FRONT_DEPTH: "observation.images.top_depth"}
-    renamed = PolicyProcessorPipeline.from_pretrained(
-        tmp_path,
-        config_filename="policy_preprocessor.json",
-        overrides={"rename_observations_processor": {"rename_map": {new: old for old, new in names.items()}}},
-    )
-    policy = redraw(PI05GeometryPolicy(config)).eval()
-    observation = make_observation()
-    incoming = {names.get(key, key): value for key, value in observation.items()}
-    assert torch.equal(chunk_of(policy, renamed(incoming)), chunk_of(policy, preprocessor(observation)))
-    policy = redraw(PI05GeometryPolicy(make_config())).eval()
-    with pytest.raises(ValueError, match=r"no image observation.images.front.*--rename_map"):
-        policy.predict_action_chunk(preprocessor(incoming))
-    with pytest.raises(ValueError, match=r"no depth from camera\(s\) front.*--rename_map"):
-        policy.predict_action_chunk(preprocessor(incoming | {FRONT: observation[FRONT]}))
-
-
-def test_an_observation_without_a_batch_gets_one():
-    config = make_config()
-    preprocessor, _ = make_processors(config)
-    policy = redraw(PI05GeometryPolicy(config)).eval()
-    batch = make_observation(1)
-    single = {key: value[0] for key, value in batch.items()}
-    assert torch.equal(chunk_of(policy, preprocessor(single)), chunk_of(policy, preprocessor(batch)))
-
-
-def test_a_state_that_is_no_number_is_refused():
-    preprocessor, _ = make_processors(make_config())
-    observation = make_observation()
-    observation[STATE][1, 2] = math.nan
-    with pytest.raises(ValueError, match=r"observation.state\[2\] is nan in sample 1"):
-        preprocessor(observation)
-
-
-# --- real-time chunking -------------------------------------------------------------------------------------------
-
-
-def make_rtc_policy(enabled: bool = True) -> PI05GeometryPolicy:
-    config = RTCConfig(
-        enabled=enabled,
-        execution_horizon=4,
-        prefix_attention_schedule=RTCAttentionSchedule.LINEAR,
-        max_guidance_weight=5.0,
-    )
-    return make_policy(rtc_config=config)
-
-
-def test_guided_chunks_follow_what_is_left_of_the_previous_one():
-    policy, batch, noise = make_rtc_policy(), make_batch(1), torch.randn(1, CHUNK, 8)
-    plain = make_policy().predict_action_chunk(batch, noise=noise)
-    unguided = policy.predict_action_chunk(batch, noise=noise)
-    assert torch.equal(unguided, plain)  # nothing is left over yet
-    left_over = plain + 1.0
-    guided = policy.predict_action_chunk(
-        batch, noise=noise, prev_chunk_left_over=left_over, inference_delay=2, execution_horizon=4
-    )
-    distance, unguided_distance = (guided - left_over).abs(), (unguided - left_over).abs()
-    assert (distance[:, :2] < 0.5 * unguided_distance[:, :2]).all()
-    assert not guided.requires_grad
-
-
-@pytest.mark.parametrize("left", [6, 3])
-def test_guidance_is_lerobots(left):
-    """The same as LeRobot's integrator and guidance around a network that recomputes everything at every step."""
-    policy, batch, noise = make_rtc_policy(), make_batch(2), torch.randn(2, CHUNK, 8)
-    left_over = torch.randn(2, left, ACTION_DIM)
-    rtc = {"prev_chunk_left_over": left_over, "inference_delay": 1, "execution_horizon": 4}
-    guided = policy.predict_action_chunk(batch, noise=noise, **rtc)
-
-    plain = make_policy()
-    images, masks = prepare_images(batch, plain.config, torch.device("cpu"))
-    context = plain.model._context(
-        images, masks, batch[TOKENS], batch[TOKEN_MASK], *plain._geometry_tokens(batch), None
-    )
-
-    def velocity(x_t: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
-        return plain.model._velocity(*context, None, x_t, time)
-
-    expected = euler_integrate(
-        velocity, noise, 3, rtc_processor=RTCProcessor(policy.config.rtc_config), rtc_enabled=True, **rtc
-    )
-    torch.testing.assert_close(guided, expected[..., :ACTION_DIM], atol=1e-5, rtol=1e-5)
-
-
-def test_rtc_works_on_whole_chunks():
-    with pytest.raises(RuntimeError, match=r"call predict_action_chunk, not select_action"):
-        make_rtc_policy().select_action(make_batch())
-    assert make_rtc_policy(enabled=False).select_action(make_batch()).shape == (2, ACTION_DIM)
-
-
-def test_rtc_can_be_switched_on_after_loading():
-    """As LeRobot's rollout does it: set the configuration, then call `init_rtc_processor`."""
-    policy = make_policy()
-    assert policy.supports_rtc()
-    policy.config.rtc_config = make_rtc_policy().config.rtc_config
-    policy.init_rtc_processor()
-    batch, noise = make_batch(1), torch.randn(1, CHUNK, 8)
-    rtc = {"prev_chunk_left_over": torch.randn(1, 4, ACTION_DIM), "inference_delay": 1, "execution_horizon": 4}
-    found = policy.predict_action_chunk(batch, noise=noise, **rtc)
-    assert torch.equal(found, make_rtc_policy().predict_action_chunk(batch, noise=noise, **rtc))

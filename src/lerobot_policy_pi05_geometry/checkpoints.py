@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from huggingface_hub import hf_hub_download
-from huggingface_hub.errors import EntryNotFoundError
+from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 from safetensors import SafetensorError, safe_open
 from torch import nn
 
@@ -23,17 +23,25 @@ def find_file(model_id: str | Path, name: str, **hub: Any) -> Path:
                 f"Checkpoint {folder} has no {name}; give the folder that holds it (pretrained_model)."
             )
         return folder / name
-    if folder.is_absolute() or str(model_id).startswith("."):
-        raise FileNotFoundError(f"Checkpoint folder {folder} is not there.")
+    if folder.is_absolute() or str(model_id).startswith((".", "~")) or str(model_id).count("/") != 1:
+        raise FileNotFoundError(f"Checkpoint folder {model_id} is not there.")
     try:
         return Path(hf_hub_download(repo_id=str(model_id), filename=name, **hub))
+    except LocalEntryNotFoundError as error:
+        raise FileNotFoundError(
+            f"Checkpoint {model_id} is no folder here, and the hub cannot be reached for its {name}, which is not cached."
+        ) from error
     except EntryNotFoundError as error:
         raise FileNotFoundError(f"Checkpoint {model_id} on the hub has no {name}.") from error
 
 
 def require_policy_type(model_id: str | Path, expected: str, **hub: Any) -> None:
     """Raise ValueError if the checkpoint is of another policy type."""
-    found = json.loads(find_file(model_id, CONFIG_FILE, **hub).read_text()).get("type")
+    path = find_file(model_id, CONFIG_FILE, **hub)
+    try:
+        found = json.loads(path.read_text())["type"]
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{path} is no policy configuration: expected a JSON object with an entry 'type'.") from error
     if found != expected:
         raise ValueError(
             f"{model_id} is a checkpoint of type '{found}', not '{expected}': its weights and processors are laid out "

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Annotated
 
 os.environ.setdefault("TQDM_DISABLE", "1")  # LeRobot's bars would draw over ours
-os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
 
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import (  # noqa: E402
+from rich.markup import escape
+from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
@@ -46,6 +46,12 @@ def _bars() -> Progress:
     )
 
 
+def _require_simulator() -> None:
+    from .sim.configuration import require_simulator
+
+    require_simulator()
+
+
 @app.command()
 def demo(
     output: Output = Path("demo"),
@@ -56,6 +62,7 @@ def demo(
     Everything happens on this machine's CPU, in some 15 minutes on two cores. An interrupted demo goes on where it
     stopped when it is started again. The report is report.html in the output folder.
     """
+    _require_simulator()
     from .demo.report import write_report
     from .demo.run import DemoSettings, run_demo
 
@@ -89,6 +96,7 @@ def record(
     seed: Annotated[int, typer.Option(help="Another seed records other episodes.")] = 0,
 ) -> None:
     """Record scripted experts into a LeRobotDataset v3 with native depth and calibration."""
+    _require_simulator()
     from .sim.record import record as record_episodes
 
     with _bars() as bars:
@@ -123,12 +131,13 @@ def evaluate(
     """Success rate of a checkpoint on a simulated task, with its 95 % interval."""
     import json
 
+    _require_simulator()
+    from .loading import load_policy
     from .sim.configuration import MetaworldRgbdEnv
     from .sim.evaluate import evaluate as run
-    from .sim.evaluate import load_for_environment
 
     environment = MetaworldRgbdEnv(task=task, cameras=cameras, image_size=image_size)
-    loaded = load_for_environment(checkpoint, environment, device)
+    loaded = load_policy(checkpoint, device, environment)
     with _bars() as bars:
         bar = bars.add_task(f"{task}, {cameras}", total=episodes)
         result = run(loaded, environment, episodes, progress=lambda done: bars.update(bar, completed=done))
@@ -168,7 +177,7 @@ def main() -> None:
     except (ValueError, FileNotFoundError, FileExistsError, ModuleNotFoundError, RuntimeError, OSError) as error:
         if os.environ.get("PI05_GEOMETRY_TRACEBACK"):
             raise
-        console.print(f"[bold red]Error[/bold red] {error}")
+        console.print(f"[bold red]Error[/bold red] {escape(str(error))}", soft_wrap=True)
         sys.exit(1)
 
 

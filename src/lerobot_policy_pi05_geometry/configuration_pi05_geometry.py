@@ -1,7 +1,8 @@
 """The policy's configuration: π0.5's, plus geometry. LeRobot finds it as `--policy.type=pi05_geometry`."""
 
+import logging
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
@@ -9,13 +10,22 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from .geometry.camera import CameraCalibration
-from .geometry.depth import METRES_PER_UNIT
-from .model.config import GeometrySegmentConfig, NetworkConfig
+from .geometry.depth import METRES_PER_UNIT, MIN_DEPTH
+from .geometry.keys import DEPTH_SUFFIX, is_geometry_key
+from .model.config import (
+    GeometryExpert,
+    GeometryPlacement,
+    GeometryPositions,
+    GeometrySegmentConfig,
+    GeometryTime,
+    NetworkConfig,
+)
 from .model.precision import DTYPES
 from .model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 
-CALIBRATION_PREFIX = "observation.calibration."
-DEPTH_SUFFIX = "_depth"
+logger = logging.getLogger(__name__)
+
+EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
 
 _CHOICES = {
     "paligemma_variant": tuple(PALIGEMMA_VARIANTS),
@@ -25,10 +35,10 @@ _CHOICES = {
     "depth_unit": tuple(METRES_PER_UNIT),
     "geometry_source": ("none", "rgbd", "random"),
     "geometry_frame": ("base", "camera"),
-    "geometry_time": ("clean", "denoise"),
-    "geometry_positions": ("sequential", "parallel"),
-    "geometry_placement": ("segment", "prefix"),
-    "geometry_expert": ("shared", "own"),
+    "geometry_time": get_args(GeometryTime),
+    "geometry_positions": get_args(GeometryPositions),
+    "geometry_placement": get_args(GeometryPlacement),
+    "geometry_expert": get_args(GeometryExpert),
 }
 
 
@@ -63,6 +73,7 @@ class PI05GeometryConfig(PreTrainedConfig):
     max_depth: float = 10.0  # metres; farther counts as not measured
     calibration_path: str | None = None  # JSON file; None: calibration.json in the dataset's meta folder
     calibration: dict[str, CameraCalibration] = field(default_factory=dict)  # what was read from it
+    calibration_given: bool = False  # whether it was given as a file, and so holds over a dataset's own
     geometry_features: dict[str, PolicyFeature] = field(
         default_factory=dict
     )  # depth and poses, set by validate_features
@@ -106,7 +117,7 @@ class PI05GeometryConfig(PreTrainedConfig):
     optimizer_eps: float = 1e-8
     optimizer_weight_decay: float = 0.01
     optimizer_grad_clip_norm: float = 1.0
-    # The group of new parameters (adapter, gate, own expert): π0.5's rate is for fine-tuning, and a gate with 8 units
+    # The group of new parameters (adapter with its embeddings, gate): π0.5's rate is for fine-tuning, and a gate with 8 units
     # to travel would need 320,000 steps of it. No weight decay, which would open a negative gate.
     geometry_lr: float = 1e-3
     geometry_eps: float = 1e-12  # a closed gate scales the adapter's gradients down
@@ -124,21 +135,34 @@ class PI05GeometryConfig(PreTrainedConfig):
         self.network()  # names variants that do not belong together
 
     def _check_numbers(self) -> None:
+        for name in ("chunk_size", "n_action_steps", "num_inference_steps", "geometry_grid", "flow_samples"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.n_obs_steps != 1:
+            raise ValueError(
+                f"This policy sees one observation at a time: n_obs_steps must be 1, got {self.n_obs_steps}."
+            )
+        if self.geometry_cameras is not None and not self.geometry_cameras:
+            raise ValueError("geometry_cameras is empty; name a camera, or set geometry_source=none.")
         if self.n_action_steps > self.chunk_size:
             raise ValueError(f"n_action_steps ({self.n_action_steps}) must not exceed chunk_size ({self.chunk_size}).")
-        if self.geometry_grid < 1:
-            raise ValueError(f"geometry_grid must be at least 1, got {self.geometry_grid}.")
         if not 0 <= self.geometry_dropout < 1:
             raise ValueError(f"geometry_dropout must be in [0, 1), got {self.geometry_dropout}.")
-        if self.flow_samples < 1:
-            raise ValueError(f"flow_samples must be at least 1, got {self.flow_samples}.")
         if self.flow_samples > 1 and self.geometry_time == "denoise" and self.geometry_source != "none":
             raise ValueError(
                 "flow_samples above 1 share one geometry segment, which geometry_time=denoise ties to a single flow time; "
                 "use geometry_time=clean."
             )
-        if self.max_depth <= 0:
-            raise ValueError(f"max_depth must be above 0 m, got {self.max_depth}.")
+        if self.geometry_placement == "prefix":
+            fixed = {"geometry_time": "clean", "geometry_positions": "sequential", "geometry_expert": "shared"}
+            for name, value in {**fixed, "geometry_gate_init": 0.0}.items():
+                if getattr(self, name) != value:
+                    raise ValueError(
+                        f"geometry_placement=prefix puts geometry among the VLM's own tokens, where {name} has no meaning; "
+                        f"leave it at {value}."
+                    )
+        if self.max_depth <= MIN_DEPTH:
+            raise ValueError(f"max_depth must be above {MIN_DEPTH} m, got {self.max_depth}.")
         if self.param_dtype == "bfloat16" and self.dtype == "float32":
             raise ValueError(
                 "param_dtype=bfloat16 needs dtype=bfloat16: float32 products of bf16 weights gain nothing."
@@ -172,15 +196,15 @@ class PI05GeometryConfig(PreTrainedConfig):
         )
 
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
-        """LeRobot calls this with a dataset's features: depth maps are known by their flag, whatever their name."""
+        """LeRobot calls this with a dataset's features: a depth map under another name would pass for an RGB camera."""
         for key, feature in features.items():
             info = feature.get("info") or {}
             depth = info.get("is_depth_map") or info.get("video.is_depth_map")
             if depth and not key.endswith(DEPTH_SUFFIX):
-                raise ValueError(
-                    f"Dataset feature {key} is a depth map, but its name does not end in '{DEPTH_SUFFIX}', by which the "
-                    f"policy finds the depth of a camera; rename it to {OBS_IMAGES}.<camera>{DEPTH_SUFFIX}."
-                )
+                logger.warning(
+                    "Dataset feature %s is a depth map, but its name does not end in '%s', by which the policy finds the "
+                    "depth of a camera; rename it to %s.<camera>%s.", key, DEPTH_SUFFIX, OBS_IMAGES, DEPTH_SUFFIX,
+                )  # fmt: skip
 
     def validate_features(self) -> None:
         """Complete the features, and move depth and calibration out of `input_features`.
@@ -193,9 +217,7 @@ class PI05GeometryConfig(PreTrainedConfig):
             if is_geometry_key(key):
                 self.geometry_features[key] = inputs.pop(key)
         for i in range(self.empty_cameras):
-            inputs[f"{OBS_IMAGES}.empty_camera_{i}"] = PolicyFeature(
-                type=FeatureType.VISUAL, shape=(3, *self.image_resolution)
-            )
+            inputs[f"{EMPTY_CAMERA}{i}"] = PolicyFeature(type=FeatureType.VISUAL, shape=(3, *self.image_resolution))
         if OBS_STATE not in inputs:
             inputs[OBS_STATE] = PolicyFeature(type=FeatureType.STATE, shape=(self.max_state_dim,))
         self.input_features = inputs
@@ -228,7 +250,7 @@ class PI05GeometryConfig(PreTrainedConfig):
 
     def may_be_absent(self, image_key: str) -> bool:
         """Whether observations may lack this RGB camera."""
-        return image_key in self.absent_cameras or image_key.startswith(f"{OBS_IMAGES}.empty_camera_")
+        return image_key in self.absent_cameras or image_key.startswith(EMPTY_CAMERA)
 
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(
@@ -258,8 +280,3 @@ class PI05GeometryConfig(PreTrainedConfig):
     @property
     def reward_delta_indices(self) -> None:
         return None
-
-
-def is_geometry_key(key: str) -> bool:
-    """Whether an observation key belongs to the geometry segment: depth of a camera, or camera calibration."""
-    return key.startswith(CALIBRATION_PREFIX) or (key.startswith(f"{OBS_IMAGES}.") and key.endswith(DEPTH_SUFFIX))

@@ -8,11 +8,13 @@ from typing import Any
 import torch
 from lerobot.configs import FeatureType, NormalizationMode
 from lerobot.policies.common.vla_utils import resize_with_pad_torch
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from .configuration_pi05_geometry import PI05GeometryConfig
 from .geometry import CameraCalibration, read_calibration_file
 from .geometry.calibration import CALIBRATION_FILE
+from .geometry.keys import extrinsics_key
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +51,9 @@ def _prepare_image(image: Tensor, key: str, config: PI05GeometryConfig) -> Tenso
     if image.ndim == 4 and image.shape[1] != 3 and image.shape[-1] == 3:
         image = image.permute(0, 3, 1, 2)
     if image.ndim != 4 or image.shape[1] != 3:
-        raise ValueError(f"{key} must be RGB images (B, 3, H, W), got shape {tuple(image.shape)}.")
+        raise ValueError(
+            f"{key} must be RGB images (B, 3, H, W), got shape {tuple(image.shape)}; depth needs a name that ends in _depth."
+        )
     image = image.float() / 255 if image.dtype == torch.uint8 else image.float()
     if tuple(image.shape[-2:]) != tuple(config.image_resolution):
         image = resize_with_pad_torch(image, *config.image_resolution)
@@ -67,10 +71,12 @@ def check_stats(config: PI05GeometryConfig, stats: Mapping[str, Mapping[str, Any
     features = {**(config.input_features or {}), **(config.output_features or {})}
     for key, feature in features.items():
         mode = config.normalization_mapping.get(FeatureType(feature.type).value, NormalizationMode.IDENTITY)
-        if mode not in _QUANTILES or key not in stats:
+        if mode not in _QUANTILES or (
+            key == OBS_STATE and key not in stats
+        ):  # a state that the data lacks is filled in
             continue
         low_name, high_name = _QUANTILES[mode]
-        if low_name not in stats[key] or high_name not in stats[key]:
+        if low_name not in stats.get(key, {}) or high_name not in stats[key]:
             raise ValueError(
                 f"The dataset has no {low_name}/{high_name} statistics for {key}, which {mode.value} normalisation needs; "
                 "add them with LeRobot's augment_dataset_quantile_stats.py, or choose another --policy.normalization_mapping."
@@ -91,17 +97,23 @@ def check_stats(config: PI05GeometryConfig, stats: Mapping[str, Mapping[str, Any
 
 
 def resolve_calibration(config: PI05GeometryConfig, dataset_meta: Any | None) -> dict[str, CameraCalibration]:
-    """The calibration to use: the file given, else the dataset's, else what the checkpoint recorded.
+    """The calibration to use: the file given, else what the checkpoint recorded, else the dataset's.
 
     The caller stores it in the configuration, so that a checkpoint carries it wherever it goes.
+    Raises ValueError if the dataset's differs from the recorded one and no file says which of them holds.
     """
     if config.calibration_path is not None:
         return read_calibration_file(config.calibration_path)
-    if dataset_meta is not None:
-        path = Path(dataset_meta.root) / "meta" / CALIBRATION_FILE
-        if path.is_file():
-            return read_calibration_file(path)
-    return config.calibration
+    path = None if dataset_meta is None else Path(dataset_meta.root) / "meta" / CALIBRATION_FILE
+    if path is None or not path.is_file():
+        return config.calibration
+    of_dataset = read_calibration_file(path)
+    if config.calibration and config.calibration != of_dataset and not config.calibration_given:
+        raise ValueError(
+            f"The dataset's calibration ({path}) differs from the one recorded in the checkpoint; say which holds with "
+            "--policy.calibration_path."
+        )
+    return config.calibration or of_dataset
 
 
 def check_calibration(config: PI05GeometryConfig, cameras: list[str]) -> None:
@@ -114,3 +126,9 @@ def check_calibration(config: PI05GeometryConfig, cameras: list[str]) -> None:
                 "--policy.calibration_path, or put it at meta/calibration.json of the dataset."
             )
         config.calibration[camera].check(camera)
+        posed = config.calibration[camera].extrinsics is not None or extrinsics_key(camera) in config.geometry_features
+        if config.geometry_frame == "base" and not posed:
+            raise ValueError(
+                f"Depth camera '{camera}' has no extrinsics: neither in its calibration nor as {extrinsics_key(camera)} in "
+                "the data; give them, or set --policy.geometry_frame=camera."
+            )

@@ -24,7 +24,7 @@ from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LAN
 from torch import Tensor, nn
 
 from .checkpoints import find_file, load_strictly, require_policy_type
-from .configuration_pi05_geometry import PI05GeometryConfig
+from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
 from .geometry import GeometryEncoder, GeometrySource
 from .geometry.random_tokens import RandomSource
 from .geometry.rgbd import RgbdSource
@@ -86,6 +86,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
                 "(LeRobot: use_depth=true on the camera), or train with --policy.geometry_source=none."
             )
         config.calibration = resolve_calibration(config, dataset_meta)
+        config.calibration_given = config.calibration_given or config.calibration_path is not None
         config.calibration_path = None  # the checkpoint now carries the content
         check_calibration(config, list(sizes))
         return RgbdSource(
@@ -101,8 +102,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def _set_trainable(self) -> None:
         network = self.model.paligemma_with_expert
         network.set_trainable(self.config.train_expert_only, self.config.freeze_vision_encoder)
-        if (
-            not self.config.image_features
+        if all(
+            key.startswith(EMPTY_CAMERA) for key in self.config.image_features
         ):  # a policy without RGB runs no vision tower, so it must not wait for its gradient
             network.paligemma.model.vision_tower.requires_grad_(False)
             network.paligemma.model.multi_modal_projector.requires_grad_(False)
@@ -178,8 +179,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if losses.ndim == 4:
             losses = losses.mean(dim=1)
         is_pad = batch.get("action_is_pad")
-        valid = torch.ones(losses.shape[:2], device=device) if is_pad is None else (~is_pad).float()  # (B, S)
-        losses = losses * valid[..., None]
+        valid = torch.ones(losses.shape[:2], dtype=torch.bool, device=device) if is_pad is None else ~is_pad  # (B, S)
+        losses = losses.masked_fill(~valid[..., None], 0.0)
         per_sample = losses.sum(dim=(1, 2)) / (valid.sum(dim=1) * action_dim)
         mean = losses.sum() / (valid.sum() * action_dim)
         info: dict[str, Any] = {"loss": mean.item()}

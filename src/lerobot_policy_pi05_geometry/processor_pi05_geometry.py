@@ -39,6 +39,7 @@ def make_pi05_geometry_pre_post_processors(
     Steps that LeRobot has keep its registry names, since lerobot-train overrides them by name. The state is normalised
     before the prompt is written from it.
     """
+    config.validate_features()  # depth and poses must not reach the normaliser, whoever builds processors first
     if dataset_stats:
         check_stats(config, dataset_stats)
     small = config.paligemma_variant != "gemma_2b"

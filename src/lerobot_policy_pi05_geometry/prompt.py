@@ -1,6 +1,6 @@
 """The prompt: task text and discretised state, and a tokenizer that travels inside the checkpoint."""
 
-import json
+import logging
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +14,8 @@ from lerobot.utils.constants import OBS_STATE
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
 from torch import Tensor
 from transformers import AutoTokenizer, PreTrainedTokenizerFast
+
+logger = logging.getLogger(__name__)
 
 STATE_BINS = 256
 PALIGEMMA_TOKENIZER = "google/paligemma-3b-pt-224"
@@ -64,7 +66,7 @@ def discretise_state(state: Tensor) -> Tensor:
             f"{OBS_STATE}[{dim}] is {state[row, dim].item()} in sample {row} of the batch; a sensor that fails must not "
             "steer the robot, so fix the source or drop the frame."
         )
-    bins = torch.floor((state.double().clamp(-1.0, 1.0) + 1.0) * (STATE_BINS / 2))
+    bins = torch.floor((state.cpu().double().clamp(-1.0, 1.0) + 1.0) * (STATE_BINS / 2))
     return bins.clamp(max=STATE_BINS - 1).long()
 
 
@@ -89,13 +91,21 @@ class PortableTokenizerProcessorStep(TokenizerProcessorStep):
     padding: str = "longest"
     _files: dict[str, bytes] = field(default_factory=dict, init=False, repr=False)
     _built: Any = field(default=None, init=False, repr=False)
+    _warned: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Nothing is loaded before it is needed; a step that is being reloaded gets its files from its state."""
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
         self.input_tokenizer = self.loaded()
-        return super()._tokenize_text(text)
+        tokens = super()._tokenize_text(text)
+        if tokens["input_ids"].shape[1] >= self.max_length and not self._warned:
+            self._warned = True
+            logger.warning(
+                "A prompt fills tokenizer_max_length (%d tokens), so its end, the state, may be cut off; raise it.",
+                self.max_length,
+            )
+        return tokens
 
     def loaded(self) -> Any:
         """The tokenizer. Raises FileNotFoundError or OSError with one sentence if it cannot be had."""
@@ -181,7 +191,7 @@ def build_small_tokenizer() -> PreTrainedTokenizerFast:
 
 def check_vocabulary(step: PortableTokenizerProcessorStep, vocab_size: int) -> None:
     """Raise ValueError if the tokenizer has ids that the network has no embedding for."""
-    largest = max(json.loads(step.loaded().backend_tokenizer.to_str())["model"]["vocab"].values(), default=0)
+    largest = max(step.loaded().get_vocab().values(), default=0)
     if largest >= vocab_size:
         raise ValueError(
             f"Tokenizer {step.tokenizer_name} has token ids up to {largest}, but the network embeds {vocab_size}; choose "

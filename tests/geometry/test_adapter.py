@@ -15,10 +15,10 @@ WIDTH, CHANNELS = 16, 5
 
 def random_adapter(grid: int, views: int, seed: int = 0) -> GeometryAdapter:
     """An adapter with every parameter redrawn; LayerNorm's start at 1 and 0 would hide errors."""
-    adapter = GeometryAdapter(CHANNELS, WIDTH, grid, views)
+    adapter, random = GeometryAdapter(CHANNELS, WIDTH, grid, views), generator(seed)
     with torch.no_grad():
         for parameter in adapter.parameters():
-            parameter.copy_(0.5 * torch.randn(parameter.shape, generator=generator(seed)))
+            parameter.copy_(0.5 * torch.randn(parameter.shape, generator=random))
     return adapter
 
 

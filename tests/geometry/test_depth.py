@@ -102,7 +102,7 @@ def test_a_wrong_unit_is_an_error_in_both_directions(seed, median):
 
 
 def test_a_wrong_unit_in_one_sample_of_a_batch_is_found():
-    depth = torch.full((2, 1, 4, 5), 700.0)
+    depth = torch.full((3, 1, 4, 5), 700.0)
     depth[1] = 0.7
     with pytest.raises(ValueError, match=r"median distance of 0.0007 m"):
         check_unit(depth, KEY, "mm")

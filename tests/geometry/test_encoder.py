@@ -141,6 +141,7 @@ def test_values_are_looked_into_once_an_episode():
     with pytest.raises(ValueError, match="unit"):
         encoder(wrong_unit)
     encoder(observation)
+    encoder(wrong_unit)
     encoder.reset()
     with pytest.raises(ValueError, match="unit"):
         encoder(wrong_unit)

@@ -237,8 +237,15 @@ def test_an_unknown_camera_range_lists_those_there_are():
 
 
 def test_a_task_of_metaworld_works_by_its_own_name():
-    task = find_task("drawer-open-v3")
-    assert dataclasses.astuple(task)[:3] == ("drawer-open-v3", "drawer open", None)
+    task = find_task("reach-v3")
+    assert dataclasses.astuple(task)[:3] == ("reach-v3", "reach", None)
+    environment = RgbdMetaworldEnv("reach-v3", "fixed", 32)
+    environment.reset(seed=0)
+    for _ in range(2):  # its expert needs the goal, which Meta-World hides from policies
+        goal = environment._simulator._target_pos
+        np.testing.assert_allclose(environment.simulator_state[-3:], goal)
+        environment.step(np.zeros(4))
+    environment.close()
 
 
 # --- recording ----------------------------------------------------------------------------------------------------
@@ -268,11 +275,13 @@ def test_what_is_recorded_is_what_the_environment_showed(recorded):
     dataset = LeRobotDataset("local/two", root=recorded[0])
     environment = RgbdMetaworldEnv(TASK, "train", 32)
     seen, _ = environment.reset(seed=FIRST_SEED)
+    action = make_expert(find_task(TASK)).get_action(environment.simulator_state).clip(-1.0, 1.0)
     environment.close()
     frame = dataset[0]
     assert np.array_equal(frame["observation.images.front_depth"].squeeze().numpy(), seen[DEPTH_KEY].squeeze())
     assert np.array_equal(frame["observation.calibration.front.extrinsics"].numpy(), seen[EXTRINSICS_KEY])
     assert np.array_equal(frame["observation.state"].numpy(), seen["agent_pos"])
+    np.testing.assert_allclose(frame["action"].numpy(), action, atol=1e-6)  # the expert's own, without the noise
     pixels = (255 * frame["observation.images.front"]).round().permute(1, 2, 0).numpy()
     assert np.array_equal(pixels, seen["pixels"]["front"])
 

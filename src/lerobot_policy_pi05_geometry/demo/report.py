@@ -10,8 +10,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from ..inspect.inspection import frame_batch
 from ..inspect.page import Page, picture, video
 from ..inspect.pictures import curves_figure, depth_figure, layout_figure, segment_share_figure, success_figure
-from ..sim.configuration import MetaworldRgbdEnv
-from ..sim.evaluate import Evaluation, LoadedPolicy, load_for_environment
+from ..loading import LoadedPolicy, load_policy
+from ..sim.evaluate import Evaluation
 from .run import ARMS, CONDITIONS, DemoSettings, checkpoint, read_curve
 
 
@@ -44,9 +44,11 @@ def write_report(folder: Path, settings: DemoSettings, results: Mapping[str, Map
     for condition, title in CONDITIONS.items():
         clips = _side_by_side(results, condition)
         if clips is not None:
-            page.row(video(clips, 10, f"Geometry left, RGB only right; {title}.", pictures / f"rollout_{condition}.mp4"))
+            page.row(
+                video(clips, 10, f"Geometry left, RGB only right; {title}.", pictures / f"rollout_{condition}.mp4")
+            )
     page.heading("Inside the policy with geometry")
-    loaded, batch = _observation(folder, settings)
+    loaded, batch = _observation(folder)
     page.row(
         picture(
             depth_figure(loaded.policy, batch),
@@ -110,8 +112,7 @@ def _side_by_side(results: Mapping[str, Mapping[str, Evaluation]], condition: st
     return np.concatenate(clips) if clips else None
 
 
-def _observation(folder: Path, settings: DemoSettings) -> tuple[LoadedPolicy, dict]:
+def _observation(folder: Path) -> tuple[LoadedPolicy, dict]:
     """The policy with geometry and the dataset's first frame, preprocessed."""
-    environment = MetaworldRgbdEnv(task=settings.task, image_size=settings.image_size)
-    loaded = load_for_environment(checkpoint(folder, "geometry"), environment)
+    loaded = load_policy(checkpoint(folder, "geometry"))
     return loaded, loaded.preprocess(frame_batch(LeRobotDataset("local/demo", root=folder / "dataset"), 0))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -9,8 +10,9 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
+from ..loading import load_policy
 from ..sim.configuration import MetaworldRgbdEnv
-from ..sim.evaluate import Evaluation, evaluate, load_for_environment
+from ..sim.evaluate import Evaluation, evaluate
 from ..sim.record import record
 
 ARMS = {
@@ -32,10 +34,10 @@ class DemoSettings:
     task: str = "button-press-topdown-wide"
     variant: str = "small"
     episodes: int = 120
-    steps: int = 900
+    steps: int = 1200
     blind_steps: int = 600
     batch_size: int = 16
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     flow_samples: int = 4
     chunk_size: int = 8
     action_steps: int = 4
@@ -64,15 +66,17 @@ def run_demo(folder: Path, settings: DemoSettings, progress: Progress) -> dict[s
     for condition in CONDITIONS:
         environment = MetaworldRgbdEnv(task=settings.task, cameras=condition, image_size=settings.image_size)
         for arm in ARMS:
-            loaded = load_for_environment(checkpoint(folder, arm), environment)
-            results[arm][condition] = evaluate(
-                loaded,
-                environment,
-                settings.evaluation_episodes,
-                parallel=settings.parallel,
-                videos=settings.videos,
-                progress=_of(partial(progress, f"evaluate {arm}, {condition}"), settings.evaluation_episodes),
-            )
+            saved = folder / f"evaluation_{arm}_{condition}.npz"
+            if not saved.exists():
+                evaluate(
+                    load_policy(checkpoint(folder, arm), environment=environment),
+                    environment,
+                    settings.evaluation_episodes,
+                    parallel=settings.parallel,
+                    videos=settings.videos,
+                    progress=_of(partial(progress, f"evaluate {arm}, {condition}"), settings.evaluation_episodes),
+                ).save(saved)
+            results[arm][condition] = Evaluation.load(saved)
     return results
 
 
@@ -135,8 +139,7 @@ def train_arm(folder: Path, arm: str, settings: DemoSettings, progress: Callable
     if checkpoint(folder, arm).exists():
         return
     output, log = folder / arm, folder / f"{arm}.log"
-    if output.exists():
-        raise FileExistsError(f"{output} holds an unfinished training; remove it to train anew, or resume it with lerobot-train.")
+    shutil.rmtree(output, ignore_errors=True)  # what is left of a training that was cut off, made anew in minutes
     command = [sys.executable, "-m", "lerobot_policy_pi05_geometry.cli", "train", *arguments(folder, arm, settings)]
     total = settings.blind_steps if arm == "blind" else settings.steps
     environment = {**os.environ, "HF_HUB_OFFLINE": "1"}

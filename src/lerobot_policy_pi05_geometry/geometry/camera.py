@@ -53,11 +53,11 @@ def check_rigid(pose: Tensor, what: str) -> None:
     """Raise ValueError unless pose, (..., 4, 4), is rotation and translation."""
     if pose.shape[-2:] != (4, 4):
         raise ValueError(f"{what} must be 4 x 4, got shape {tuple(pose.shape)}.")
-    rotation = pose[..., :3, :3].double()
-    identity = torch.eye(3, dtype=torch.float64, device=pose.device)
-    error = (rotation.mT @ rotation - identity).abs().amax(dim=(-1, -2))
-    last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=pose.device)
-    error = torch.maximum(error, (pose[..., 3, :].double() - last_row).abs().amax(dim=-1))
+    pose = pose.detach().cpu().double()
+    rotation = pose[..., :3, :3]
+    error = (rotation.mT @ rotation - torch.eye(3, dtype=torch.float64)).abs().amax(dim=(-1, -2))
+    last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    error = torch.maximum(error, (pose[..., 3, :] - last_row).abs().amax(dim=-1))
     good = pose.isfinite().all(dim=-1).all(dim=-1) & (error < RIGID_TOLERANCE) & (torch.linalg.det(rotation) > 0)
     if not good.all():
         raise ValueError(

@@ -11,6 +11,10 @@ from torch import Tensor
 METRES_PER_UNIT = {"m": 1.0, "mm": 1e-3}
 # Median distance of what a manipulator's camera sees; outside it the declared unit is wrong.
 PLAUSIBLE_MEDIAN = (0.02, 20.0)
+# LeRobot's 12-bit depth video spans 0.01 to 10 m: a hole (0) reads back as 0.01 m, and all that is farther as 10 m.
+# Neither is a measurement, so valid depth is above MIN_DEPTH and below the configured maximum.
+MIN_DEPTH = 0.02
+_CODEC_FLOOR = 0.01
 _DTYPES = (torch.uint16, torch.int16, torch.int32, torch.float16, torch.float32, torch.float64)
 
 
@@ -18,10 +22,10 @@ def to_metres(depth: Tensor, key: str, unit: str, size: tuple[int, int], max_dep
     """Normalise a depth batch.
 
     depth: (B, 1, H, W), (B, H, W, 1) or (B, H, W). key: its name, for messages. unit: "mm" or "m". size: (H, W) that
-    the policy was configured with. max_depth: metres; what is farther counts as not measured.
+    the policy was configured with. max_depth: metres; what is as far or farther counts as not measured.
 
     Returns depth in metres, z along the optical axis, (B, 1, H, W) float32 with zeros where not valid, and validity
-    (B, 1, H, W) bool. NaN, inf, zero, negative and too far are not valid.
+    (B, 1, H, W) bool. NaN, inf, nearer than MIN_DEPTH and too far are not valid.
 
     Raises ValueError for a dtype that no depth camera gives or a wrong size.
     """
@@ -40,7 +44,7 @@ def to_metres(depth: Tensor, key: str, unit: str, size: tuple[int, int], max_dep
             "(height x width, one channel); use the camera resolution it was trained with."
         )
     metres = depth.float() * METRES_PER_UNIT[unit]
-    valid = torch.isfinite(metres) & (metres > 0) & (metres <= max_depth)
+    valid = torch.isfinite(metres) & (metres > MIN_DEPTH) & (metres < max_depth)
     return metres.masked_fill(~valid, 0.0), valid
 
 
@@ -59,9 +63,9 @@ def check_unit(depth: Tensor, key: str, unit: str) -> None:
 
     depth: as given to `to_metres`, before validity (a wrong unit would make everything "too far").
     """
-    frames = depth.float().flatten(1)
-    seen = frames.isfinite() & (frames > 0)
-    metres = frames.masked_fill(~seen, float("nan")).nanmedian(dim=1).values * METRES_PER_UNIT[unit]
+    metres = depth.float().flatten(1) * METRES_PER_UNIT[unit]
+    seen = metres.isfinite() & (metres > 0) & ((metres - _CODEC_FLOOR).abs() > 1e-4)
+    metres = metres.masked_fill(~seen, float("nan")).nanmedian(dim=1).values
     low, high = PLAUSIBLE_MEDIAN
     wrong = (metres < low) | (metres > high)  # NaN (nothing measured) is neither
     if wrong.any():

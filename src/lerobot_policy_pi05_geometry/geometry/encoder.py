@@ -1,8 +1,8 @@
 """Source and adapter together, and what to do when a depth camera fails.
 
-In training, a missing or dead camera is an error: the data is wrong. On a robot it is weather: once geometry has been
-seen, a camera that goes silent (its key is missing, or no pixel is valid) is masked, said once, and used again when it
-returns. A robot whose depth camera was never seen is misconfigured, which is an error again.
+In training, a missing camera or a frame of NaN is an error: the data is wrong. On a robot it is weather: once geometry has
+been seen, a camera that goes silent (its key is missing, or no pixel is valid) is masked, said once, and used again when
+it returns. A robot that never had a depth key is misconfigured, which is an error again.
 """
 
 import logging
@@ -11,7 +11,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from ..model.precision import compute_in_float32
 from .adapter import GeometryAdapter
+from .keys import batch_like, depth_key, extrinsics_key
 from .source import GeometryFeatures, GeometrySource
 
 logger = logging.getLogger(__name__)
@@ -33,24 +35,28 @@ class GeometryEncoder(nn.Module):
         self._checked = False
 
     def forward(self, batch: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        if self.training:
-            missing = self.source.missing_cameras(batch)
-            if missing:
-                raise ValueError(self._missing_message(missing))
-            return self.adapter(self.source(batch, check=True))
-        return self.adapter(self._live(batch))
+        # A caller's autocast would place points to within millimetres only, and training's is not inference's.
+        with compute_in_float32(batch_like(batch).device):
+            return self.adapter(self._measured(batch) if self.training else self._live(batch))
+
+    def _measured(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
+        """Features of a training batch, where every camera must be there."""
+        missing = self.source.missing_cameras(batch)
+        if missing:
+            raise ValueError(_missing_message(missing))
+        return self.source(batch, check=True)
 
     def _live(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
         """Features at inference: a camera that fails is masked, once it has been seen."""
         missing = self.source.missing_cameras(batch)
         unknown = [camera for camera in missing if camera not in self._seen]
         if unknown:
-            raise ValueError(self._missing_message(unknown))
+            raise ValueError(_missing_message(unknown))
         if len(missing) == len(self.source.cameras):
             self._report(set(missing))
             return self._nothing(batch)
         geometry = self.source(batch, check=not self._checked)
-        self._checked = True
+        self._checked = self._checked or bool(geometry.valid.any())
         # One look per call at which cameras are dead costs a synchronisation; on a robot B is 1 and V a handful.
         alive = geometry.valid.any(dim=-1).any(dim=0).tolist()
         dead = {camera for camera, ok in zip(self.source.cameras, alive, strict=True) if not ok}
@@ -60,7 +66,7 @@ class GeometryEncoder(nn.Module):
 
     def _nothing(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
         """Features of an observation without any geometry: all masked."""
-        like = next(v for k, v in batch.items() if k.startswith("observation.") and isinstance(v, Tensor))
+        like = batch_like(batch)
         shape = (like.shape[0], len(self.source.cameras), self.source.grid**2)
         return GeometryFeatures(
             torch.zeros(*shape, self.source.feature_dim, device=like.device),
@@ -75,9 +81,12 @@ class GeometryEncoder(nn.Module):
             logger.info("Depth camera '%s' is back.", camera)
         self._failed = failed
 
-    def _missing_message(self, cameras: list[str]) -> str:
-        keys = ", ".join(f"observation.images.{camera}_depth" for camera in cameras)
-        return (
-            f"The observation has no depth from camera(s) {', '.join(cameras)}: expected {keys}; connect the depth "
-            "camera, rename its key with --rename_map, or train with --policy.geometry_source=none."
-        )
+
+def _missing_message(cameras: list[str]) -> str:
+    keys = ", ".join(depth_key(camera) for camera in cameras)
+    poses = ", ".join(extrinsics_key(camera) for camera in cameras)
+    return (
+        f"The observation has no depth from camera(s) {', '.join(cameras)}: expected {keys} (and, for a camera without "
+        f"extrinsics in its calibration, {poses}); connect the depth camera, rename its key with --rename_map, or train "
+        "with --policy.geometry_source=none."
+    )

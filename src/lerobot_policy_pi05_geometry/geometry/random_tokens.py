@@ -5,6 +5,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from .keys import batch_like
+from .rgbd import FEATURE_DIM
 from .source import GeometryFeatures, GeometrySource
 
 _SEED = 20250101
@@ -13,7 +15,7 @@ _SEED = 20250101
 class RandomSource(GeometrySource):
     """Fixed standard-normal features, the same for every observation and every run."""
 
-    def __init__(self, cameras: tuple[str, ...], grid: int, feature_dim: int = 55) -> None:
+    def __init__(self, cameras: tuple[str, ...], grid: int, feature_dim: int = FEATURE_DIM) -> None:
         super().__init__()
         self.cameras, self.grid, self.feature_dim = cameras, grid, feature_dim
         generator = torch.Generator().manual_seed(_SEED)
@@ -23,6 +25,6 @@ class RandomSource(GeometrySource):
         return []
 
     def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
-        like = next(v for k, v in batch.items() if k.startswith("observation.") and isinstance(v, Tensor))
+        like = batch_like(batch)
         features = self._features.to(like.device).expand(like.shape[0], -1, -1, -1)
         return GeometryFeatures(features, torch.ones(features.shape[:3], dtype=torch.bool, device=like.device))

@@ -12,20 +12,12 @@ from torch import Tensor
 
 from .camera import CameraCalibration, check_rigid, transform, unproject
 from .depth import check_measured, check_unit, to_metres
+from .keys import depth_key, extrinsics_key
 from .source import GeometryFeatures, GeometrySource
 
 # Wavelengths of the Fourier features of a point, in metres: from a workspace down to the width of a finger.
 WAVELENGTHS = tuple(8.0 / 2**k for k in range(8))
-
-
-def depth_key(camera: str) -> str:
-    """Where the depth of a camera stands in a batch."""
-    return f"observation.images.{camera}_depth"
-
-
-def extrinsics_key(camera: str) -> str:
-    """Where the pose of a camera stands in a batch, if it comes with every frame."""
-    return f"observation.calibration.{camera}.extrinsics"
+FEATURE_DIM = 7 + 6 * len(WAVELENGTHS)
 
 
 class RgbdSource(GeometrySource):
@@ -48,15 +40,22 @@ class RgbdSource(GeometrySource):
     ) -> None:
         super().__init__()
         self.cameras, self.grid = cameras, grid
-        self.feature_dim = 7 + 6 * len(WAVELENGTHS)
+        self.feature_dim = FEATURE_DIM
         self.sizes, self.base_frame, self.unit, self.max_depth = dict(sizes), base_frame, unit, max_depth
         self.calibration = {camera: calibration[camera] for camera in cameras}
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
-        return [camera for camera in self.cameras if depth_key(camera) not in batch]
+        return [
+            camera for camera in self.cameras if depth_key(camera) not in batch or not self._has_pose(camera, batch)
+        ]
+
+    def _has_pose(self, camera: str, batch: Mapping[str, Tensor]) -> bool:
+        known = not self.base_frame or self.calibration[camera].extrinsics is not None
+        return known or extrinsics_key(camera) in batch
 
     def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
-        present = [camera for camera in self.cameras if depth_key(camera) in batch]
+        missing = self.missing_cameras(batch)
+        present = [camera for camera in self.cameras if camera not in missing]
         if not present:
             raise ValueError(f"No depth in the batch; expected {', '.join(depth_key(c) for c in self.cameras)}.")
         measured = {camera: self._camera(camera, batch, check) for camera in present}
@@ -79,6 +78,7 @@ class RgbdSource(GeometrySource):
         points = unproject(depth, torch.tensor(calibration.scaled_intrinsics(*depth.shape[-2:]), device=depth.device))
         if self.base_frame:
             points = transform(self._pose(camera, batch, check), points)
+        valid = valid & points.isfinite().all(dim=1, keepdim=True)  # a pose that turns NaN places nothing
         return cell_statistics(points, valid, self.grid)
 
     def _pose(self, camera: str, batch: Mapping[str, Tensor], check: bool) -> Tensor:
@@ -89,13 +89,7 @@ class RgbdSource(GeometrySource):
             if check:
                 check_rigid(pose, key)
             return pose
-        extrinsics = self.calibration[camera].extrinsics
-        if extrinsics is None:
-            raise ValueError(
-                f"Camera '{camera}' has no extrinsics: neither {key} in the batch nor a pose in its calibration; give "
-                "one, or set --policy.geometry_frame=camera."
-            )
-        return torch.tensor(extrinsics, device=batch[depth_key(camera)].device)
+        return torch.tensor(self.calibration[camera].extrinsics, device=batch[depth_key(camera)].device)
 
 
 def cell_statistics(points: Tensor, valid: Tensor, grid: int) -> GeometryFeatures:

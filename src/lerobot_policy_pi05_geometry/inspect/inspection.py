@@ -3,11 +3,9 @@
 from pathlib import Path
 
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies import make_policy, make_pre_post_processors
 
-from ..modeling_pi05_geometry import PI05GeometryPolicy
+from ..loading import load_policy
 from .page import Page, picture
 from .pictures import depth_figure, layout_figure, segment_share_figure
 
@@ -21,21 +19,12 @@ def write_inspection(checkpoint: str, root: Path, repo_id: str, frame: int, devi
         raise FileNotFoundError(
             f"{root} is no LeRobotDataset: it has no meta/info.json; give --dataset.root its folder."
         )
-    dataset = LeRobotDataset(repo_id, root=root)
+    loaded = load_policy(checkpoint, device)
+    policy = loaded.policy
+    dataset = LeRobotDataset(repo_id, root=root, depth_output_unit=policy.config.depth_unit)
     if not 0 <= frame < len(dataset):
         raise ValueError(f"The dataset has frames 0 to {len(dataset) - 1}, there is no frame {frame}.")
-    config = PreTrainedConfig.from_pretrained(checkpoint)
-    config.pretrained_path = Path(checkpoint)
-    config.device = device
-    policy = make_policy(config, ds_meta=dataset.meta)
-    if not isinstance(policy, PI05GeometryPolicy):
-        raise ValueError(
-            f"{checkpoint} is a checkpoint of policy type '{config.type}'; this looks into 'pi05_geometry' ones."
-        )
-    preprocess, _ = make_pre_post_processors(
-        policy_cfg=config, pretrained_path=checkpoint, preprocessor_overrides={"device_processor": {"device": device}}
-    )
-    batch = preprocess(frame_batch(dataset, frame))
+    batch = loaded.preprocess(frame_batch(dataset, frame))
     page = Page(f"{Path(checkpoint).name} on frame {frame} of {root.name}")
     page.lead(f"Task: {dataset[frame]['task']}")
     if policy.geometry is not None and policy.config.geometry_source == "rgbd":

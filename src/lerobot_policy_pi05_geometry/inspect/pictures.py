@@ -13,7 +13,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from ..geometry.depth import to_metres
-from ..geometry.rgbd import depth_key
+from ..geometry.keys import depth_key
 from ..modeling_pi05_geometry import PI05GeometryPolicy
 from .attention import attention_layout, suffix_attention
 
@@ -58,14 +58,12 @@ def depth_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Fig
     axes = figure.subplots(len(source.cameras), 3, squeeze=False)
     for row, camera in zip(axes, source.cameras, strict=True):
         rgb = _rgb(batch, camera)
+        size = policy.config.depth_cameras()[camera]
+        shown = np.full(size, np.nan)
         if depth_key(camera) in batch:
-            size = policy.config.depth_cameras()[camera]
-            depth, valid = to_metres(
-                batch[depth_key(camera)][:1].cpu(), camera, policy.config.depth_unit, size, policy.config.max_depth
-            )
+            raw = batch[depth_key(camera)][:1].cpu()
+            depth, valid = to_metres(raw, camera, policy.config.depth_unit, size, policy.config.max_depth)
             shown = np.where(valid[0, 0].numpy(), depth[0, 0].numpy(), np.nan)
-        else:
-            shown = np.full(rgb.shape[:2], np.nan)
         if rgb is not None:
             row[0].imshow(rgb)
         row[0].set_title(f"{camera}: RGB, what the VLM sees")

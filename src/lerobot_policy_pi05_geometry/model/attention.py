@@ -35,13 +35,17 @@ class Attention(nn.Module):
     def forward(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor, bias: Tensor | None = None) -> Tensor:
         """q (B, H, Q, D), k and v (B, KV, K, D), mask (B, 1 or Q, K) bool, bias (H, K) float32 or None -> (B, H, Q, D)."""
         needs_grad = torch.is_grad_enabled() and q.requires_grad
-        gate_needs_grad = torch.is_grad_enabled() and bias is not None and bias.requires_grad
-        if gate_needs_grad or (needs_grad and q.device.type == "cpu"):
+        # The gate needs a gradient, or more than bf16's three digits.
+        gate_in_float32 = bias is not None and (
+            q.dtype != torch.float32 or (torch.is_grad_enabled() and bias.requires_grad)
+        )
+        if gate_in_float32 or (needs_grad and q.device.type == "cpu"):
             weights = attention_weights(q, k, mask, bias)  # (B, H, Q, K)
             return torch.matmul(_fold(weights, v), v).view_as(q)
-        return F.scaled_dot_product_attention(
-            q, k, v, attn_mask=_logit_bias(mask, bias, q.dtype), enable_gqa=q.shape[1] != k.shape[1]
-        )
+        # Keys are expanded as views: with `enable_gqa` and a mask, CUDA has no fast kernel.
+        shared = q.shape[1] // k.shape[1]
+        k, v = (x[:, :, None].expand(-1, -1, shared, -1, -1).flatten(1, 2) for x in (k, v))
+        return F.scaled_dot_product_attention(q, k, v, attn_mask=_logit_bias(mask, bias, q.dtype))
 
 
 def attention_weights(q: Tensor, k: Tensor, mask: Tensor, bias: Tensor | None = None) -> Tensor:

@@ -17,7 +17,6 @@ class GeometryGate(Float32Module):
 
     def __init__(self, num_layers: int, num_heads: int, init: float) -> None:
         super().__init__()
-        self.init = init
         self.log_gate = nn.Parameter(torch.full((num_layers, num_heads), float(init)))
 
     def forward(self, layer: int, before: int, geometry: int, after: int) -> Tensor:

@@ -57,10 +57,10 @@ class AdaRMSNorm(nn.Module):
         if cond is None:
             raise ValueError("An adaptive norm needs `adarms_cond`, the embedded flow time of its segment.")
         modulation = self.dense(cond)
-        if cond.ndim == 3:
-            modulation = modulation.repeat_interleave(x.shape[1] // cond.shape[1], dim=1)
-        else:
+        if cond.ndim == 2:
             modulation = modulation[:, None]
+        else:
+            modulation = modulation.repeat_interleave(x.shape[1] // cond.shape[1], dim=1)
         scale, shift, gate = modulation.chunk(3, dim=-1)
         return (_normalise(x) * (1.0 + scale) + shift).to(x.dtype), gate.to(x.dtype)
 
@@ -199,7 +199,7 @@ class GemmaModel(nn.Module):
 
 
 def _init_weights(module: nn.Module) -> None:
-    """Normal with variance 1 / width, Gemma's 0.02 at full size; norms start at zero, so that adaRMS is the identity."""
+    """Normal with variance 1 / fan-in (0.022 at the VLM's width); norms start at zero, so that adaRMS is the identity."""
     if isinstance(module, nn.Embedding) or (isinstance(module, nn.Linear) and not isinstance(module, Float32Linear)):
         nn.init.normal_(module.weight, std=module.weight.shape[1] ** -0.5)
     elif isinstance(module, AdaRMSNorm):

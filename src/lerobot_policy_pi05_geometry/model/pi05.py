@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F  # noqa: N812
 from lerobot.policies.common.flow_matching import euler_integrate
+from lerobot.utils.device_utils import get_safe_dtype
 from torch import Tensor, nn
 
 from .cache import SegmentKVCache
@@ -81,11 +82,12 @@ class PI05Pytorch(nn.Module):
         return SegmentTokens(_silence(embedded, pad), pad, [0] * pad.shape[1])
 
     def embed_time(self, timestep: Tensor) -> Tensor:
-        """Flow time (B,) -> adaRMS condition (B, W) float32: sine-cosine embedding in float64, then an MLP."""
+        """Flow time (B,) -> adaRMS condition (B, W) float32: sine-cosine embedding, in float64 where there is one, and an MLP."""
         width = self.action_in_proj.out_features
-        exponent = torch.linspace(0.0, 1.0, width // 2, dtype=torch.float64, device=timestep.device)
+        dtype = get_safe_dtype(torch.float64, timestep.device.type)
+        exponent = torch.linspace(0.0, 1.0, width // 2, dtype=dtype, device=timestep.device)
         period = self.config.min_period * (self.config.max_period / self.config.min_period) ** exponent
-        angle = timestep[:, None].double() * (2 * math.pi / period)
+        angle = timestep[:, None].to(dtype) * (2 * math.pi / period)
         embedded = torch.cat([angle.sin(), angle.cos()], dim=1).float()
         return F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(embedded))))
 

@@ -6,8 +6,8 @@ whatever these say, because bfloat16 (8 bits of mantissa) would lose what they a
 * `Float32Linear` and the geometry gate: they are trained with small updates, and an update below 1/256 of a weight
   vanishes in a bf16 weight. These are the geometry adapter, the gate, the action projections (their output is
   integrated over ten flow steps) and the flow-time MLP (its input has periods down to 0.004).
-* RMSNorm: mean and scale are taken in float32 and its weight is stored in float32 (a scale of 1 + w loses w below
-  1/256), including the linear map of the adaptive norm, through which alone the flow time acts.
+* Norms: mean and scale are taken in float32 and their weights stored in float32 (a scale of 1 + w loses w below 1/256),
+  SigLIP's LayerNorms and the linear map of the adaptive norm included, through which alone the flow time acts.
 
 bf16 compute over float32 storage is autocast; a float32 module switches autocast off around itself, since a float32
 Linear under autocast returns bf16.
@@ -50,8 +50,10 @@ class Float32Linear(Float32Module, nn.Linear):
 
 
 def store_in(module: nn.Module, dtype: torch.dtype) -> None:
-    """Cast the parameters of `module` to their storage dtype, leaving float32 modules as they are."""
-    for child in module.modules():
-        target = torch.float32 if isinstance(child, Float32Module) else dtype
-        for parameter in child.parameters(recurse=False):
-            parameter.data = parameter.data.to(target)
+    """Cast the parameters of `module` to their storage dtype, leaving float32 modules and all in them as they are."""
+    keep = isinstance(module, Float32Module | nn.LayerNorm)
+    for parameter in module.parameters(recurse=keep):
+        parameter.data = parameter.data.to(torch.float32 if keep else dtype)
+    if not keep:
+        for child in module.children():
+            store_in(child, dtype)

@@ -1,5 +1,6 @@
 """The environment as LeRobot knows it: `--env.type=metaworld_rgbd`."""
 
+import os
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -54,13 +55,9 @@ class MetaworldRgbdEnv(EnvConfig):
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        try:
-            from .environment import RgbdMetaworldEnv
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(
-                f"The simulated tasks need {error.name}; install them with "
-                "`pip install 'lerobot_policy_pi05_geometry[sim]'`."
-            ) from error
+        require_simulator()
+        from .environment import RgbdMetaworldEnv
+
         make = freeze_after_episode_end(partial(RgbdMetaworldEnv, **self.gym_kwargs))
         mode = gym.vector.AutoresetMode.NEXT_STEP
         if use_async_envs and n_envs > 1:
@@ -70,3 +67,19 @@ class MetaworldRgbdEnv(EnvConfig):
         else:
             vector = gym.vector.SyncVectorEnv([make] * n_envs, autoreset_mode=mode)
         return {self.type: {0: vector}}
+
+
+def require_simulator() -> None:
+    """Raise ModuleNotFoundError, saying what to do, unless MuJoCo, Meta-World and an EGL library are there."""
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        import metaworld.policies  # noqa: F401
+        import mujoco.gl_context  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"The simulated tasks need {error.name}; install them with `pip install 'lerobot_policy_pi05_geometry[sim]'`."
+        ) from error
+    except (ImportError, AttributeError) as error:
+        raise ModuleNotFoundError(
+            "MuJoCo finds no EGL library for headless rendering; install one (Debian: apt-get install libegl1)."
+        ) from error

@@ -4,7 +4,7 @@ import os
 
 os.environ.setdefault("MUJOCO_GL", "egl")  # headless; must be set before MuJoCo is imported
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import mujoco
@@ -37,7 +37,7 @@ class RgbdMetaworldEnv(gym.Env):
     gripper opening. Action (4,) in [-1, 1]: hand displacement and gripper effort. An episode ends with success.
     """
 
-    metadata: ClassVar[dict] = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
     render_mode = "rgb_array"
 
     def __init__(

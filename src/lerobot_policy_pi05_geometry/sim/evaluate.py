@@ -7,25 +7,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.envs import preprocess_observation
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
-from lerobot.policies import make_policy, make_pre_post_processors
 from scipy.stats import binomtest
 
-from ..modeling_pi05_geometry import PI05GeometryPolicy
+from ..loading import LoadedPolicy
 from .configuration import MetaworldRgbdEnv
 
 CONFIDENCE = 0.95
-
-
-@dataclass
-class LoadedPolicy:
-    """A policy with its processors, ready to act in an environment."""
-
-    policy: PI05GeometryPolicy
-    preprocess: Callable[[dict], dict]
-    postprocess: Callable[[torch.Tensor], torch.Tensor]
 
 
 @dataclass
@@ -47,6 +36,20 @@ class Evaluation:
         interval = binomtest(sum(self.successes), len(self.successes)).proportion_ci(CONFIDENCE, method="wilson")
         return float(interval.low), float(interval.high)
 
+    def save(self, path: Path) -> None:
+        """Write outcomes and videos to one file, whole or not at all."""
+        unfinished = path.with_suffix(".unfinished.npz")
+        videos = {f"video_{i}": video for i, video in enumerate(self.videos)}
+        np.savez_compressed(unfinished, seeds=self.seeds, successes=self.successes, steps=self.steps, **videos)  # type: ignore[arg-type]
+        unfinished.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> "Evaluation":
+        """Read what `save` wrote."""
+        with np.load(path, allow_pickle=False) as file:
+            videos = [file[name] for name in sorted(name for name in file.files if name.startswith("video_"))]
+            return cls(file["seeds"].tolist(), file["successes"].tolist(), file["steps"].tolist(), videos)
+
     def to_json(self) -> dict[str, Any]:
         """Everything but the videos."""
         low, high = self.interval()
@@ -59,20 +62,6 @@ class Evaluation:
                 for seed, success, steps in zip(self.seeds, self.successes, self.steps, strict=True)
             ],
         }
-
-
-def load_for_environment(checkpoint: str | Path, environment: MetaworldRgbdEnv, device: str = "cpu") -> LoadedPolicy:
-    """Load a checkpoint folder or hub id and its processors for an environment, as lerobot-eval does."""
-    config = PreTrainedConfig.from_pretrained(checkpoint)
-    config.pretrained_path = Path(checkpoint)
-    config.device = device
-    policy = make_policy(config, env_cfg=environment)
-    preprocess, postprocess = make_pre_post_processors(
-        policy_cfg=config,
-        pretrained_path=str(checkpoint),
-        preprocessor_overrides={"device_processor": {"device": device}},
-    )
-    return LoadedPolicy(policy, preprocess, postprocess)
 
 
 def evaluate(
@@ -97,7 +86,7 @@ def evaluate(
         for start in range(0, episodes, parallel):
             seeds = [first_seed + start + i for i in range(parallel)]
             torch.manual_seed(seeds[0])
-            success, steps, frames = _rollout(loaded, vector, seeds)
+            success, steps, frames = _rollout(loaded, vector, seeds, keep_frames=len(result.videos) < videos)
             count = min(parallel, episodes - start)
             result.seeds += seeds[:count]
             result.successes += success[:count].tolist()
@@ -110,14 +99,16 @@ def evaluate(
     return result
 
 
-def _rollout(loaded: LoadedPolicy, vector: Any, seeds: list[int]) -> tuple[np.ndarray, np.ndarray, list]:
+def _rollout(
+    loaded: LoadedPolicy, vector: Any, seeds: list[int], keep_frames: bool
+) -> tuple[np.ndarray, np.ndarray, list]:
     """One batch of episodes to their ends: success and number of steps per episode, and all frames."""
     loaded.policy.reset()
     observation, _ = vector.reset(seed=seeds, options={NEW_ROLLOUT_OPTION: True})
     done = np.zeros(len(seeds), dtype=bool)
     success = np.zeros(len(seeds), dtype=bool)
     steps = np.zeros(len(seeds), dtype=int)
-    frames = [vector.call("render")]
+    frames = [vector.call("render")] if keep_frames else []
     while not done.all():
         batch = preprocess_observation(observation)
         batch["task"] = list(vector.call("task_description"))
@@ -127,5 +118,6 @@ def _rollout(loaded: LoadedPolicy, vector: Any, seeds: list[int]) -> tuple[np.nd
         steps += ~done
         success |= terminated & ~done
         done |= terminated | truncated
-        frames.append(vector.call("render"))
+        if keep_frames:
+            frames.append(vector.call("render"))
     return success, steps, frames

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from datasets.utils.logging import disable_progress_bar
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from ..geometry.calibration import CALIBRATION_FILE, write_calibration_file
@@ -54,6 +55,7 @@ def record(
         raise FileExistsError(f"{root} already exists; choose another folder, or remove it to record anew.")
     unfinished = root.with_name(f".{root.name}.unfinished")
     shutil.rmtree(unfinished, ignore_errors=True)
+    disable_progress_bar()  # one per episode would bury ours
     environment = RgbdMetaworldEnv(task, cameras, image_size)
     dataset = LeRobotDataset.create(
         repo_id,

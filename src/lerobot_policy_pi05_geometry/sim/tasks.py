@@ -19,7 +19,7 @@ class TaskSpec:
     environment: str
     instruction: str
     object_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    max_steps: int = 40
+    max_steps: int = 30
 
 
 WIDE_TASKS = {

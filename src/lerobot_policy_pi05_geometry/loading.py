@@ -1,0 +1,44 @@
+"""A checkpoint with its processors, ready to act: what lerobot-eval does, for our own commands."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_policy, make_pre_post_processors
+
+from .checkpoints import require_policy_type
+from .modeling_pi05_geometry import PI05GeometryPolicy
+
+
+@dataclass
+class LoadedPolicy:
+    """A policy with its processors."""
+
+    policy: PI05GeometryPolicy
+    preprocess: Callable[[dict], dict]
+    postprocess: Callable[[torch.Tensor], torch.Tensor]
+
+
+def load_policy(checkpoint: str | Path, device: str = "cpu", environment: Any | None = None) -> LoadedPolicy:
+    """Load a checkpoint folder or hub id.
+
+    environment: a LeRobot `EnvConfig` whose features the policy has to fit, or None.
+    Raises FileNotFoundError or ValueError, with one sentence, for what is no checkpoint of this policy.
+    """
+    require_policy_type(checkpoint, PI05GeometryPolicy.name)
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.pretrained_path = Path(checkpoint)
+    config.device = device
+    if environment is None:
+        policy = PI05GeometryPolicy.from_pretrained(checkpoint, config=config)
+    else:
+        policy = make_policy(config, env_cfg=environment)
+    preprocess, postprocess = make_pre_post_processors(
+        policy_cfg=config,
+        pretrained_path=str(checkpoint),
+        preprocessor_overrides={"device_processor": {"device": device}},
+    )
+    return LoadedPolicy(policy, preprocess, postprocess)
