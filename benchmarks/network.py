@@ -5,7 +5,8 @@
 
 All three run the same weights and inputs in one process, in turn, round by round; a ratio is the median over rounds of
 ours / LeRobot's in the same round. Peak memory is that of a process that builds one of them and predicts one chunk.
-Prompts have the length that the batch needs; LeRobot always pads them to 200.
+Ours pads prompts to what the batch needs (`--prompt` tokens), LeRobot's always to 200: `--prompt 200` takes that apart.
+"geometry" is what the segment adds to the prefix: prefix and geometry together, minus prefix, of the same round.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from torch import Tensor
 
 from benchmarks.lerobot_pi05 import build_lerobot_pi05, copy_weights
 from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, NetworkConfig, PI05Pytorch
-from lerobot_policy_pi05_geometry.model.precision import compute_in
+from lerobot_policy_pi05_geometry.model.precision import Float32Module, compute_in
 from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 
 ARMS = ("geometry", "no geometry", "lerobot")
@@ -61,7 +62,7 @@ def build(arm: str, args: argparse.Namespace, weights: torch.nn.Module | None = 
     with default_dtype(dtype):
         network = PI05Pytorch(config)
     for module in network.modules():  # what is stored in float32 was built in the default dtype
-        if module.__class__.__name__ in ("Float32Linear", "RMSNorm", "GeometryGate"):
+        if isinstance(module, Float32Module | torch.nn.LayerNorm):
             module.float()
     if weights is not None:
         copy_weights(weights, network)
@@ -73,8 +74,8 @@ def inputs(args: argparse.Namespace, tokens: int) -> dict:
     generator = torch.Generator().manual_seed(1)
     size = 224 if args.full else 84
     text = torch.zeros(1, tokens, dtype=torch.long)
-    text[:, :PROMPT] = torch.randint(3, 1000, (1, PROMPT), generator=generator)
-    mask = torch.arange(tokens)[None] < PROMPT
+    text[:, : args.prompt] = torch.randint(3, 1000, (1, args.prompt), generator=generator)
+    mask = torch.arange(tokens)[None] < args.prompt
     return {
         "images": [torch.rand(1, 3, size, size, generator=generator) * 2 - 1 for _ in range(args.cameras)],
         "img_masks": [torch.ones(1, dtype=torch.bool)] * args.cameras,
@@ -86,7 +87,7 @@ def inputs(args: argparse.Namespace, tokens: int) -> dict:
 
 def parts(arm: str, network, args: argparse.Namespace) -> dict[str, Callable[[], Tensor]]:
     """What is timed, as functions without arguments."""
-    batch = inputs(args, 200 if arm == "lerobot" else PROMPT)
+    batch = inputs(args, 200 if arm == "lerobot" else args.prompt)
     noise = batch.pop("noise")
     observation = (batch["images"], batch["img_masks"], batch["tokens"], batch["masks"])
     now = torch.full((1,), 0.5)
@@ -139,7 +140,7 @@ def times(args: argparse.Namespace) -> dict[str, dict[str, list[float]]]:
     functions = {arm: parts(arm, lerobot if arm == "lerobot" else ours, args) for arm in ARMS}
     result: dict[str, dict[str, list[float]]] = {arm: {part: [] for part in PARTS} for arm in ARMS}
     for round_index in range(args.rounds + 1):
-        for part in PARTS:
+        for part in functions["lerobot"]:
             for arm in ARMS:
                 start = time.perf_counter()
                 for _ in range(args.repeat if part != "chunk" else 1):
@@ -147,6 +148,9 @@ def times(args: argparse.Namespace) -> dict[str, dict[str, list[float]]]:
                 seconds = (time.perf_counter() - start) / (args.repeat if part != "chunk" else 1)
                 if round_index:  # the first round warms up
                     result[arm][part].append(seconds)
+    both, alone = result["geometry"]["prefix"], result["no geometry"]["prefix"]
+    result["geometry"]["geometry"] = [a - b for a, b in zip(both, alone, strict=True)]
+    result["geometry"]["prefix"] = alone
     return result
 
 
@@ -169,6 +173,7 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="released size in bfloat16")
     parser.add_argument("--cameras", type=int, default=1)
     parser.add_argument("--chunk", type=int, default=50, help="action steps")
+    parser.add_argument("--prompt", type=int, default=100, help="prompt tokens; a state of 14 numbers takes some 70")
     parser.add_argument("--geometry-tokens", type=int, default=64)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--repeat", type=int, default=3, help="prefixes and steps per round")
@@ -191,12 +196,13 @@ def main() -> None:
     summary: dict = {"machine": f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"}
     summary["settings"] = {k: v for k, v in vars(args).items() if k not in ("memory_of", "output")}
     for arm in ARMS:
-        row = {}
-        line = f"{arm:14}"
+        row, line = {}, f"{arm:14}"
         for part in PARTS:
-            ratios = [a / b for a, b in zip(measured[arm][part], measured["lerobot"][part], strict=True)]
-            row[part] = {"ms": 1e3 * statistics.median(measured[arm][part]), "ratio": statistics.median(ratios)}
-            line += f"{row[part]['ms']:16.1f}{row[part]['ratio']:8.2f}"
+            values, peer = measured[arm][part], measured["lerobot"][part]
+            milliseconds = 1e3 * statistics.median(values) if values else None
+            ratio = statistics.median(a / b for a, b in zip(values, peer, strict=True)) if values and peer else None
+            row[part] = {"ms": milliseconds, "ratio": ratio}
+            line += f"{'-' if milliseconds is None else f'{milliseconds:.1f}':>16}{'-' if ratio is None else f'{ratio:.2f}':>8}"
         row["peak"] = {"GiB": memory[arm], "ratio": memory[arm] / memory["lerobot"]}
         print(line + f"{memory[arm]:12.2f}{row['peak']['ratio']:8.2f}")
         summary[arm] = row

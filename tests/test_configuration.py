@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
-from lerobot_policy_pi05_geometry.configuration_pi05_geometry import is_geometry_key
+from lerobot_policy_pi05_geometry.geometry.keys import is_geometry_key
 from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 from tests.doors import FRONT, FRONT_DEPTH, STATE, WRIST, WRIST_DEPTH, WRIST_POSE, make_calibration, make_config
 
@@ -121,14 +121,15 @@ def depth_feature(flag: str) -> dict:
 
 @pytest.mark.parametrize("flag", ["is_depth_map", "video.is_depth_map"])
 @pytest.mark.parametrize("key", ["observation.images.front_range", "observation.front_depth", "observation.depth"])
-def test_a_depth_map_under_a_name_that_the_policy_would_not_know_is_refused(flag, key):
-    """It would reach SigLIP as an RGB image."""
-    with pytest.raises(ValueError, match=rf"{key} is a depth map.*rename it") as caught:
-        make_config().set_dataset_feature_metadata({key: depth_feature(flag)})
-    one_sentence(caught.value)
+def test_a_depth_map_under_a_name_that_the_policy_does_not_know_is_reported(flag, key, caplog):
+    """It would pass for an RGB camera."""
+    make_config().set_dataset_feature_metadata({key: depth_feature(flag)})
+    (record,) = caplog.records
+    assert f"{key} is a depth map" in record.getMessage()
+    assert "rename it to observation.images.<camera>_depth" in record.getMessage()
 
 
-def test_depth_maps_by_their_known_name_and_other_features_pass():
+def test_depth_maps_by_their_known_name_and_other_features_pass(caplog):
     make_config().set_dataset_feature_metadata(
         {
             FRONT_DEPTH: depth_feature("is_depth_map"),
@@ -136,6 +137,7 @@ def test_depth_maps_by_their_known_name_and_other_features_pass():
             STATE: {"dtype": "float32", "shape": (7,), "names": None},
         }
     )
+    assert not caplog.records
 
 
 # --- saving -------------------------------------------------------------------------------------------------------
@@ -210,9 +212,15 @@ def test_an_unknown_choice_is_refused_with_those_there_are(name, value, known):
         ({"geometry_dropout": 1.0}, r"geometry_dropout must be in \[0, 1\), got 1.0"),
         ({"geometry_dropout": -0.1}, "geometry_dropout"),
         ({"geometry_dropout": float("nan")}, "geometry_dropout"),
-        ({"max_depth": 0.0}, "max_depth must be above 0 m, got 0.0"),
+        ({"max_depth": 0.02}, "max_depth must be above 0.02 m, got 0.02"),
         ({"max_depth": float("nan")}, "max_depth"),
         ({"flow_samples": 0}, "flow_samples must be at least 1"),
+        ({"flow_samples": 2, "geometry_time": "denoise"}, "use geometry_time=clean"),
+        ({"n_obs_steps": 2}, "n_obs_steps must be 1, got 2"),
+        ({"geometry_cameras": []}, "geometry_cameras is empty"),
+        ({"geometry_placement": "prefix", "geometry_time": "denoise"}, "geometry_time has no meaning"),
+        ({"geometry_placement": "prefix", "geometry_expert": "own"}, "geometry_expert has no meaning"),
+        ({"geometry_placement": "prefix", "geometry_gate_init": -8.0}, "geometry_gate_init has no meaning"),
         ({"param_dtype": "bfloat16"}, "param_dtype=bfloat16 needs dtype=bfloat16"),
         ({"image_resolution": (28, 42)}, r"image_resolution must be square, got \(28, 42\)"),
         ({"image_resolution": (30, 30)}, "image_resolution must be a multiple of the vision tower's patch size 14"),

@@ -7,6 +7,7 @@ import pytest
 import torch
 from lerobot.configs import NormalizationMode
 
+from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
 from lerobot_policy_pi05_geometry.inputs import check_stats, prepare_images, resolve_calibration
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
@@ -72,6 +73,13 @@ def test_missing_quantiles_are_named(key, name):
         check(stats_with(key, **{name: None}))
 
 
+def test_an_action_without_any_statistics_is_named():
+    """Without a state in the data, the policy fills one in."""
+    with pytest.raises(ValueError, match="no q01/q99 statistics for action"):
+        check({STATE: make_stats()[STATE]})
+    check({"action": make_stats()["action"]})
+
+
 def test_the_quantiles_of_the_chosen_mode_are_asked_for():
     mapping = {"STATE": NormalizationMode.QUANTILE10}
     with pytest.raises(ValueError, match=rf"no q10/q90 statistics for {STATE}, which QUANTILE10 normalisation needs"):
@@ -134,20 +142,34 @@ def dataset(tmp_path) -> SimpleNamespace:
     return SimpleNamespace(root=tmp_path / "dataset")
 
 
-def test_a_given_file_comes_before_the_datasets_and_that_before_the_recorded_one(tmp_path, dataset):
+def focal_length(config: PI05GeometryConfig, meta: SimpleNamespace | None) -> float:
+    return resolve_calibration(config, meta)["front"].intrinsics[0]
+
+
+def test_a_given_file_comes_first(tmp_path, dataset):
     write_calibration_file(tmp_path / "given.json", calibration_with_focal_length(10.0))
     config = make_config(calibration=calibration_with_focal_length(30.0), calibration_path=str(tmp_path / "given.json"))
+    assert focal_length(config, dataset) == focal_length(config, None) == 10.0
 
-    def focal_length(meta) -> float:
-        return resolve_calibration(config, meta)["front"].intrinsics[0]
 
-    assert focal_length(dataset) == 10.0
-    config.calibration_path = None
-    assert focal_length(dataset) == 20.0
-    assert focal_length(SimpleNamespace(root=str(dataset.root))) == 20.0
-    assert focal_length(None) == 30.0
+def test_what_was_given_once_holds_over_the_datasets(dataset):
+    config = make_config(calibration=calibration_with_focal_length(30.0), calibration_given=True)
+    assert focal_length(config, dataset) == 30.0
+
+
+def test_without_a_given_file_the_datasets_holds_and_without_that_the_recorded_one(dataset):
+    assert focal_length(make_config(calibration={}), dataset) == 20.0
+    assert focal_length(make_config(calibration={}), SimpleNamespace(root=str(dataset.root))) == 20.0
+    recorded = make_config(calibration=calibration_with_focal_length(30.0))
+    assert focal_length(recorded, None) == 30.0
     (dataset.root / "meta" / "calibration.json").unlink()
-    assert focal_length(dataset) == 30.0
+    assert focal_length(recorded, dataset) == 30.0
+
+
+def test_a_dataset_that_contradicts_the_checkpoint_is_an_error(dataset):
+    assert focal_length(make_config(calibration=calibration_with_focal_length(20.0)), dataset) == 20.0
+    with pytest.raises(ValueError, match=r"calibration.json\) differs from the one recorded.*calibration_path"):
+        focal_length(make_config(calibration=calibration_with_focal_length(30.0)), dataset)
 
 
 def test_the_policy_keeps_what_it_read_and_not_where_from(tmp_path):
@@ -155,6 +177,7 @@ def test_the_policy_keeps_what_it_read_and_not_where_from(tmp_path):
     policy = PI05GeometryPolicy(make_config(calibration={}, calibration_path=str(tmp_path / "given.json")))
     assert policy.config.calibration == calibration_with_focal_length(10.0)
     assert policy.config.calibration_path is None
+    assert policy.config.calibration_given
     policy.save_pretrained(tmp_path / "saved")
     (tmp_path / "given.json").unlink()
     loaded = PI05GeometryPolicy.from_pretrained(tmp_path / "saved")
@@ -166,8 +189,8 @@ def test_a_file_that_is_not_there_is_an_error_and_not_the_next_choice(dataset):
         resolve_calibration(make_config(calibration_path="nowhere.json"), dataset)
 
 
-@pytest.mark.parametrize("recorded", [{}, calibration_with_focal_length(30.0)], ids=["none", "another"])
-def test_the_policy_takes_the_datasets_calibration(dataset, recorded):
-    policy = PI05GeometryPolicy(make_config(calibration=recorded), dataset_meta=dataset)
+def test_the_policy_takes_the_datasets_calibration(dataset):
+    policy = PI05GeometryPolicy(make_config(calibration={}), dataset_meta=dataset)
     assert policy.geometry.source.calibration == calibration_with_focal_length(20.0)
     assert policy.config.calibration == calibration_with_focal_length(20.0)
+    assert not policy.config.calibration_given

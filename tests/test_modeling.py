@@ -5,7 +5,9 @@ import copy
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies import make_policy as lerobot_make_policy
 
+from lerobot_policy_pi05_geometry import MetaworldRgbdEnv
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from tests.doors import (
     ACTION_DIM,
@@ -365,6 +367,16 @@ def test_empty_cameras_change_nothing():
     torch.testing.assert_close(chunk_of(with_empty, make_batch()), expected, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("changes", [{}, {"empty_cameras": 1}, {"absent_cameras": [WRIST]}])
+def test_lerobot_builds_policies_with_cameras_that_the_data_lacks(changes):
+    """LeRobot compares the RGB cameras of a policy with those of the data, where depth is among them."""
+    inputs, outputs = make_features()
+    config = make_config(input_features=inputs, output_features=outputs, geometry_cameras=["front"], **changes)
+    if "absent_cameras" not in changes:
+        del config.input_features[WRIST]
+    assert isinstance(lerobot_make_policy(config, env_cfg=MetaworldRgbdEnv()), PI05GeometryPolicy)
+
+
 @pytest.mark.parametrize("shape", [(2, 1, 30, 40), (2, 4, 30, 40), (3, 30, 40), (2, 30, 40)])
 def test_an_image_that_is_not_rgb_is_refused(shape):
     with pytest.raises(ValueError, match=rf"{FRONT} must be RGB images \(B, 3, H, W\), got shape"):
@@ -391,10 +403,11 @@ def test_random_tokens_take_as_much_room_and_look_at_nothing():
     policy.train().forward(batch)[0].backward()
 
 
-def test_a_blind_policy_trains_and_acts():
+@pytest.mark.parametrize("empty_cameras", [0, 1])
+def test_a_blind_policy_trains_and_acts(empty_cameras):
     _, outputs = make_features()
-    inputs = {STATE: PolicyFeature(FeatureType.STATE, (7,))}
-    policy = make_policy(input_features=inputs, output_features=outputs, geometry_source="none").train()
+    features = {"input_features": {STATE: PolicyFeature(FeatureType.STATE, (7,))}, "output_features": outputs}
+    policy = make_policy(**features, geometry_source="none", empty_cameras=empty_cameras).train()
     batch = without(make_batch(), FRONT, WRIST, *GEOMETRY)
     policy.forward(batch)[0].backward()
     for name, parameter in policy.named_parameters():
@@ -410,11 +423,34 @@ def test_random_tokens_of_no_camera_are_refused():
         make_policy(input_features=inputs, output_features=outputs, geometry_source="random")
 
 
+def test_a_policy_may_see_by_depth_alone():
+    inputs, outputs = make_features()
+    inputs = {key: feature for key, feature in inputs.items() if key not in (FRONT, WRIST)}
+    policy, batch = (
+        make_policy(input_features=inputs, output_features=outputs).train(),
+        without(make_batch(), FRONT, WRIST),
+    )
+    policy.forward(batch)[0].backward()
+    for name, parameter in policy.named_parameters():
+        assert (parameter.grad is not None) == parameter.requires_grad, name
+    assert chunk_of(policy, batch).shape == (2, CHUNK, ACTION_DIM)
+
+
 def test_depth_cameras_need_depth_in_the_data():
     inputs, outputs = make_features()
     inputs = {key: feature for key, feature in inputs.items() if key not in GEOMETRY}
     with pytest.raises(ValueError, match=r"geometry_source=rgbd needs depth.*geometry_source=none"):
         make_policy(input_features=inputs, output_features=outputs)
+
+
+def test_depth_cameras_need_extrinsics_in_the_base_frame():
+    calibration = make_calibration()
+    calibration["front"].extrinsics = None
+    with pytest.raises(
+        ValueError, match=r"'front' has no extrinsics.*calibration.front.extrinsics.*geometry_frame=camera"
+    ):
+        make_policy(calibration=calibration)
+    make_policy(calibration=calibration, geometry_frame="camera")
 
 
 def test_depth_cameras_need_intrinsics():

@@ -21,6 +21,7 @@ from tests.doors import (
     make_config,
     make_observation,
     make_processors,
+    make_stats,
     redraw,
     without,
 )
@@ -69,7 +70,7 @@ def test_the_normaliser_does_not_know_geometry():
 def test_processors_may_be_made_before_the_policy():
     """Whatever is made first, depth and poses come through untouched."""
     spread = {"q01": -torch.ones(4, 4), "q99": 3 * torch.ones(4, 4)}
-    preprocessor, _ = make_pi05_geometry_pre_post_processors(make_config(), {WRIST_POSE: spread})
+    preprocessor, _ = make_pi05_geometry_pre_post_processors(make_config(), make_stats() | {WRIST_POSE: spread})
     observation = make_observation()
     assert torch.equal(preprocessor(dict(observation))[WRIST_POSE], observation[WRIST_POSE])
 

@@ -160,6 +160,16 @@ def test_prompts_are_cut_at_the_longest_allowed():
     assert run(preprocessor)[TOKENS].shape == (2, 12)
 
 
+def test_a_prompt_that_may_have_lost_its_state_is_said_once(caplog):
+    preprocessor, _ = make_processors(make_config(tokenizer_max_length=12))
+    run(preprocessor)
+    run(preprocessor)
+    assert [
+        record.getMessage() for record in caplog.records if "tokenizer_max_length (12 tokens)" in record.getMessage()
+    ]
+    assert len(caplog.records) == 1
+
+
 def make_other_tokenizer(size: int = 300, kind: str = "words") -> PreTrainedTokenizerFast:
     """A tokenizer with `size` ids that splits otherwise than the built-in one. kind: how its vocabulary is kept."""
     letters = [chr(i) for i in range(32, 127)]
@@ -170,6 +180,8 @@ def make_other_tokenizer(size: int = 300, kind: str = "words") -> PreTrainedToke
         inside = words[: size // 2] if kind == "added" else words
         tokenizer = Tokenizer(models.WordLevel({word: i for i, word in enumerate(inside)}, unk_token="<unk>"))
         tokenizer.add_tokens([AddedToken(word) for word in words[len(inside) :]])
+    if kind == "special":
+        tokenizer.add_special_tokens([AddedToken("<image>", special=True)])
     tokenizer.pre_tokenizer = pre_tokenizers.Split("", "isolated")
     return PreTrainedTokenizerFast(tokenizer_object=tokenizer, pad_token="<pad>", unk_token="<unk>")
 
@@ -259,8 +271,9 @@ def test_a_tokenizer_too_large_for_the_vocabulary_is_refused(tmp_path, kind):
         make_processors(make_config(tokenizer_path=str(tmp_path / "large")))
 
 
-@pytest.mark.parametrize("kind", ["words", "added", "unigram"])
+@pytest.mark.parametrize("kind", ["words", "added", "unigram", "special"])
 def test_a_tokenizer_that_just_fits_is_taken(tmp_path, kind):
+    """Special: PaliGemma's own has <image> at 257,152, one past its embeddings; no prompt contains it."""
     make_other_tokenizer(1024, kind).save_pretrained(tmp_path / "fits")
     step = PortableTokenizerProcessorStep(tokenizer_name=str(tmp_path / "fits"))
     check_vocabulary(step, 1024)

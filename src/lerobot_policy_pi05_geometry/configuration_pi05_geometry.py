@@ -163,10 +163,6 @@ class PI05GeometryConfig(PreTrainedConfig):
                     )
         if self.max_depth <= MIN_DEPTH:
             raise ValueError(f"max_depth must be above {MIN_DEPTH} m, got {self.max_depth}.")
-        if self.param_dtype == "bfloat16" and self.dtype == "float32":
-            raise ValueError(
-                "param_dtype=bfloat16 needs dtype=bfloat16: float32 products of bf16 weights gain nothing."
-            )
         if self.image_resolution[0] != self.image_resolution[1]:
             raise ValueError(f"image_resolution must be square, got {tuple(self.image_resolution)}.")
 

@@ -22,7 +22,9 @@ def root(tmp_path_factory):
 def test_every_sample_equals_lerobots(root, episodes, unit):
     """Chunks that run over an episode's end and episodes that were left out included."""
     settings = {"episodes": episodes, "return_uint8": True, "depth_output_unit": unit}
-    dataset = LeRobotDataset("local/frames", root=root, delta_timestamps={"action": [i / 20 for i in range(6)]}, **settings)
+    dataset = LeRobotDataset(
+        "local/frames", root=root, delta_timestamps={"action": [i / 20 for i in range(6)]}, **settings
+    )
     frames = FramesInMemory(dataset)
     assert len(frames) == len(dataset)
     for index in [*range(0, len(dataset), 3), len(dataset) - 1]:

@@ -51,7 +51,7 @@ def test_far_uint16_is_far_and_not_negative():
     torch.testing.assert_close(metres, torch.full((1, 1, 4, 4), 60.0))
 
 
-@given(seed=seeds, bad=st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -0.5, 4.01]))
+@given(seed=seeds, bad=st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -0.5, 0.01, 4.0, 4.01]))
 def test_what_was_not_measured_is_zero_and_not_valid(seed, bad):
     random = generator(seed)
     depth = 0.1 + 3.9 * torch.rand(2, 1, 6, 7, generator=random)
@@ -61,9 +61,11 @@ def test_what_was_not_measured_is_zero_and_not_valid(seed, bad):
     assert torch.equal(metres, depth.masked_fill(hole, 0.0))
 
 
-def test_max_depth_itself_is_valid():
-    _, valid = to_metres(torch.full((1, 4, 4), 4.0), KEY, "m", (4, 4), max_depth=4.0)
-    assert valid.all()
+def test_what_a_depth_video_makes_of_holes_and_of_far_points_is_not_valid():
+    """LeRobot's codec spans 0.01 to 10 m, and writes what lies outside as its two ends."""
+    depth = torch.tensor([[[10.0, 21.0, 500.0, 9_990.0, 10_000.0]]])
+    _, valid = to_metres(depth, KEY, "mm", (1, 5), max_depth=10.0)
+    assert valid.flatten().tolist() == [False, True, True, True, False]
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.int64, torch.complex64])
@@ -109,5 +111,5 @@ def test_a_wrong_unit_in_one_sample_of_a_batch_is_found():
 
 
 def test_a_frame_without_measurement_says_nothing_about_the_unit():
-    for nothing in (0.0, math.nan, math.inf, -1.0):
+    for nothing in (0.0, math.nan, math.inf, -1.0, 10.0):  # 10 mm is a hole in LeRobot's depth video
         check_unit(torch.full((1, 1, 4, 5), nothing), KEY, "mm")

@@ -147,6 +147,13 @@ def test_values_are_looked_into_once_an_episode():
         encoder(wrong_unit)
 
 
+@pytest.mark.parametrize("training", [True, False])
+def test_a_pose_that_was_never_there_is_an_error(training):
+    encoder = GeometryEncoder(make_source({"wrist": calibrated(12, 18)}, 2), 16).train(training)
+    with pytest.raises(ValueError, match=r"no depth from camera\(s\) wrist.*observation.calibration.wrist.extrinsics"):
+        encoder(observe(encoder))
+
+
 @pytest.mark.parametrize("pose", ["missing", "NaN"])
 def test_a_pose_that_fails_in_the_middle_of_an_episode_is_masked_like_depth(pose):
     """A wrist camera without its pose measures nothing that could be placed in the base frame."""
@@ -160,6 +167,16 @@ def test_a_pose_that_fails_in_the_middle_of_an_episode_is_masked_like_depth(pose
     tokens, pad = encoder(observation)
     assert tokens.isfinite().all()
     assert not pad.any()
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_a_callers_autocast_does_not_blur_the_points(training):
+    encoder = make_encoder("front").train(training)
+    observation = observe(encoder)
+    expected, _ = encoder(observation)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        tokens, _ = encoder(observation)
+    assert torch.equal(tokens, expected)
 
 
 def test_the_random_control_has_no_camera_that_could_fail():

@@ -284,10 +284,12 @@ def test_a_wrong_unit_is_refused(declared, distance, training):
         one_camera(unit=declared).train(training)({depth_key("front"): torch.full((1, 1, 12, 18), distance)})
 
 
-def test_missing_extrinsics_are_refused_in_the_base_frame():
+def test_a_camera_without_extrinsics_is_missing_from_the_base_frame_only():
+    batch = {depth_key("wrist"): torch.ones(1, 1, 12, 18)}
     source = make_source({"wrist": calibrated(12, 18)}, 3)
-    with pytest.raises(ValueError, match=r"Camera 'wrist' has no extrinsics.*wrist.extrinsics.*geometry_frame"):
-        source({depth_key("wrist"): torch.ones(1, 1, 12, 18)})
+    assert source.missing_cameras(batch) == ["wrist"]
+    assert source.missing_cameras(batch | {extrinsics_key("wrist"): torch.eye(4)[None]}) == []
+    assert make_source({"wrist": calibrated(12, 18)}, 3, base_frame=False).missing_cameras(batch) == []
 
 
 @pytest.mark.parametrize("kind", ["scaled", "reflected", "NaN"])

@@ -88,6 +88,17 @@ def test_the_gate_gets_a_gradient() -> None:
     assert (bias.grad[:, ~visible] == 0).all()
 
 
+def test_the_gate_keeps_its_digits_in_bf16() -> None:
+    """A bias of 20.06 would be 20 in bf16: the softmax over two keys must still tell it from 20."""
+    q, k = torch.zeros(1, 1, 1, HEAD_DIM, dtype=torch.bfloat16), torch.zeros(1, 1, 2, HEAD_DIM, dtype=torch.bfloat16)
+    v = torch.tensor([1.0, 0.0], dtype=torch.bfloat16)[:, None].expand(1, 1, 2, HEAD_DIM)
+    mask, bias = torch.ones(1, 1, 2, dtype=torch.bool), torch.tensor([[20.06, 20.0]])
+    for needs_grad in (False, True):
+        attended = Attention()(q.requires_grad_(needs_grad), k, v, mask, bias)
+        assert attended.dtype == torch.bfloat16
+        assert attended.unique().item() == pytest.approx(torch.tensor(0.06).sigmoid().item(), abs=0.003)
+
+
 def test_weights_are_the_softmax() -> None:
     """`attention_weights` sum to one over the visible keys and give the rest nothing."""
     q, k, _, mask = inputs(3, 8, 2, None)

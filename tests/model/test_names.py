@@ -33,8 +33,8 @@ def theirs(variants: tuple[str, str]) -> Shapes:
     """Names and shapes of LeRobot's network, without its two lm_heads; nothing is allocated."""
     with torch.device("meta"):
         found = shapes(build_lerobot_pi05(*variants, **SIZES))
-    for name in LM_HEADS:
-        del found[name]
+    vocabulary = PALIGEMMA_VARIANTS[variants[0]].vocab_size
+    assert [found.pop(name)[0] for name in LM_HEADS] == [vocabulary, vocabulary]
     return found
 
 

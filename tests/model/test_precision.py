@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from lerobot_policy_pi05_geometry.model import PI05Pytorch
 from lerobot_policy_pi05_geometry.model.gate import GeometryGate
 from lerobot_policy_pi05_geometry.model.gemma import AdaRMSNorm, RMSNorm
-from lerobot_policy_pi05_geometry.model.precision import Float32Linear, Float32Module, compute_in
+from lerobot_policy_pi05_geometry.model.precision import Float32Linear, compute_in
 
 from .helpers import (
     OWN_EXPERT,
@@ -17,6 +17,7 @@ from .helpers import (
     Case,
     build_network,
     name_of,
+    randomise,
     recorded_caches,
     recorded_outputs,
     sample,
@@ -64,29 +65,26 @@ def test_caching_is_exact_enough_in_bf16(param_dtype: torch.dtype) -> None:
 
 @storages
 def test_float32_modules_stay_float32(param_dtype: torch.dtype) -> None:
-    """Norms, adaptive norms, gate, action projections and the flow-time MLP are stored in float32, the rest as told."""
+    """Norms of every kind, gate, action projections and the flow-time MLP are stored in float32, the rest as told."""
     network = build_network(OWN_EXPERT, dtype=BF16, param_dtype=param_dtype)
-    exempt: set[str] = set()
+    exempt = set()
     for name, module in network.named_modules():
-        if isinstance(module, Float32Module):
-            exempt |= {f"{name}.{leaf}" for leaf, _ in module.named_parameters(recurse=False)}
-    parts = (
-        "norm.weight",
-        "norm.dense.weight",
+        stays = isinstance(module, RMSNorm | Float32Linear | GeometryGate | nn.LayerNorm)
+        for leaf, parameter in module.named_parameters(prefix=name, recurse=False):
+            assert parameter.dtype == (torch.float32 if stays else param_dtype), leaf
+            exempt |= {leaf} if stays else set()
+    for part in (
+        "language_model.norm.weight",
+        "gemma_expert.model.norm.dense.weight",
+        "geometry_expert.layers.0.input_layernorm.dense.bias",
+        "vision_model.post_layernorm.weight",
         "log_gate",
         "action_in_proj.weight",
         "action_out_proj.bias",
         "time_mlp_in.weight",
-    )
-    for part in parts:
+        "time_mlp_out.weight",
+    ):
         assert any(name.endswith(part) for name in exempt), part
-    for name, parameter in network.named_parameters():
-        assert parameter.dtype == (torch.float32 if name in exempt else param_dtype), name
-    assert {type(m) for m in network.modules() if isinstance(m, Float32Module)} == {
-        Float32Linear,
-        RMSNorm,
-        GeometryGate,
-    }
 
 
 @storages
@@ -136,6 +134,17 @@ def test_float32_linear_is_an_island() -> None:
     assert inside.dtype == torch.float32
     assert torch.equal(inside, linear(x.float()))
     assert rounded.dtype == after.dtype == BF16  # autocast was on, and is on again
+
+
+def test_norms_are_computed_in_float32() -> None:
+    """Mean square and scale are taken in float32 and rounded once, whatever the dtype of the input."""
+    x = torch.randn(3, 50, 64, generator=torch.Generator().manual_seed(0)).to(BF16)
+    cond = torch.randn(3, 16, generator=torch.Generator().manual_seed(1))
+    for norm in (RMSNorm(64), AdaRMSNorm(64, 16)):
+        randomise(norm, seed=2)
+        with compute_in(BF16, x.device):
+            found, _ = norm(x, cond)
+        assert torch.equal(found, norm(x.float(), cond)[0].to(BF16))
 
 
 def test_adaptive_norm_keeps_small_scales() -> None:

@@ -34,8 +34,8 @@ class DemoSettings:
     task: str = "button-press-topdown-wide"
     variant: str = "small"
     episodes: int = 120
-    steps: int = 1200
-    blind_steps: int = 600
+    steps: int = 1000
+    blind_steps: int = 500
     batch_size: int = 16
     learning_rate: float = 2e-3
     flow_samples: int = 4
@@ -143,7 +143,7 @@ def train_arm(folder: Path, arm: str, settings: DemoSettings, progress: Callable
     command = [sys.executable, "-m", "lerobot_policy_pi05_geometry.cli", "train", *arguments(folder, arm, settings)]
     total = settings.blind_steps if arm == "blind" else settings.steps
     environment = {**os.environ, "HF_HUB_OFFLINE": "1"}
-    with log.open("w") as file:
+    with log.open("w", buffering=1) as file:
         process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, bufsize=1
         )

@@ -61,6 +61,11 @@ def _fold(x: Tensor, shared: Tensor) -> Tensor:
 
 
 def _logit_bias(mask: Tensor, bias: Tensor | None, dtype: torch.dtype) -> Tensor:
-    """What is added to the logits, (B, 1 or H, 1 or Q, K): 0 or the gate on visible keys, -inf on the others."""
-    hidden = torch.zeros(mask.shape, dtype=dtype, device=mask.device).masked_fill(~mask, float("-inf"))[:, None]
+    """What is added to the logits, (B, 1 or H, 1 or Q, K): 0 or the gate on visible keys, the lowest number on others.
+
+    Not -inf: a row that sees nothing would be NaN.
+    """
+    hidden = torch.zeros(mask.shape, dtype=dtype, device=mask.device).masked_fill(~mask, torch.finfo(dtype).min)[
+        :, None
+    ]
     return hidden if bias is None else hidden + bias[:, None].to(dtype)

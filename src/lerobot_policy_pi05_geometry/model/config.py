@@ -61,6 +61,10 @@ class NetworkConfig:
                     f"{getattr(vlm, name)} and {getattr(self.expert, name)}. Choose variants of one family "
                     "(gemma_2b with gemma_300m, small with small, tiny with tiny)."
                 )
+        if self.param_dtype == torch.bfloat16 and self.dtype == torch.float32:
+            raise ValueError(
+                "param_dtype=bfloat16 needs dtype=bfloat16: float32 products of bf16 weights gain nothing."
+            )
         if self.image_size % self.paligemma.vision.patch_size:
             raise ValueError(
                 f"image_resolution must be a multiple of the vision tower's patch size "

@@ -45,7 +45,10 @@ def draw_flow(
     noise, time, dropout = [], [], []
     for index in indices:
         generator = np.random.Generator(
-            np.random.Philox(key=[seed & _MASK, index & _MASK], counter=[0, 0, 0, step & _MASK])
+            np.random.Philox(
+                key=np.array([seed & _MASK, index & _MASK], dtype=np.uint64),
+                counter=np.array([0, 0, 0, step & _MASK], dtype=np.uint64),
+            )
         )
         noise.append(generator.standard_normal((samples, *shape), dtype=np.float32))
         time.append(generator.beta(alpha, beta, samples) * scale + offset)

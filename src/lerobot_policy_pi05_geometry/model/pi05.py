@@ -74,7 +74,9 @@ class PI05Pytorch(nn.Module):
         embs, pads = [], []
         present = [(image, mask) for image, mask in zip(images, img_masks, strict=True) if image is not None]
         if present:
-            patches = network.embed_image(torch.cat([image for image, _ in present]))  # (V * B, patches, W_vlm)
+            # What a masked image holds must not reach a gradient either: 0 x NaN is NaN in the backward pass.
+            shown = [image.masked_fill(~mask[:, None, None, None], 0.0) for image, mask in present]
+            patches = network.embed_image(torch.cat(shown))  # (V * B, patches, W_vlm)
             embs = list(patches.chunk(len(present)))
             pads = [mask[:, None].expand(-1, patches.shape[1]) for _, mask in present]
         pad = torch.cat([*pads, masks], dim=1)

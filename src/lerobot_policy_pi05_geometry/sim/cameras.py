@@ -3,10 +3,10 @@
 import math
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 from ..geometry.camera import CameraCalibration
+from .headless import mujoco
 
 LOOK_AT = (0.0, 0.72, 0.08)  # metres, robot base frame: the middle of the table
 BASE_AZIMUTH = 225.0  # degrees; from here the arm does not stand in front of the object

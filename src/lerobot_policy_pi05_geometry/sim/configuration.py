@@ -1,6 +1,5 @@
 """The environment as LeRobot knows it: `--env.type=metaworld_rgbd`."""
 
-import os
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -71,10 +70,11 @@ class MetaworldRgbdEnv(EnvConfig):
 
 def require_simulator() -> None:
     """Raise ModuleNotFoundError, saying what to do, unless MuJoCo, Meta-World and an EGL library are there."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     try:
-        import metaworld.policies  # noqa: F401
-        import mujoco.gl_context  # noqa: F401
+        from . import headless  # noqa: F401  MuJoCo first: Meta-World imports it too
+
+        import metaworld.policies  # noqa: F401  isort: skip
+        import mujoco.gl_context  # noqa: F401  isort: skip
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             f"The simulated tasks need {error.name}; install them with `pip install 'lerobot_policy_pi05_geometry[sim]'`."

@@ -1,16 +1,12 @@
 """The gymnasium environment: a Meta-World task seen by one calibrated RGB-D camera."""
 
-import os
-
-os.environ.setdefault("MUJOCO_GL", "egl")  # headless; must be set before MuJoCo is imported
-
 from typing import Any
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 
 from .cameras import CAMERA_RANGES, extrinsics, intrinsics
+from .headless import mujoco
 from .tasks import find_task, make_simulator
 
 CAMERA = "front"
