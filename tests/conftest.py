@@ -1,5 +1,8 @@
 """Settings that all tests share."""
 
+import os
+
+import torch
 from hypothesis import Phase, settings
 
 # The same examples in every run: a test that compares floating-point numbers must not fail one night in a hundred.
@@ -12,3 +15,7 @@ settings.register_profile(
     phases=[Phase.explicit, Phase.generate, Phase.shrink],
 )
 settings.load_profile("repeatable")
+
+# Tiny networks spend their time in threads waiting for each other; LeRobot's own processes inherit the variable.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+torch.set_num_threads(1)

@@ -73,7 +73,8 @@ def load_strictly(module: nn.Module, path: str | Path) -> None:
                     wrong.append(f"{name} (dtype {dtype}, expected {target.dtype})")
             _complain(path, "has wrong", wrong)
             for name, target in expected.items():
-                _assign(module, name, file.get_tensor(name).to(target.dtype))
+                # A clone, not the memory-mapped file, which could be overwritten beneath a running policy.
+                _assign(module, name, file.get_tensor(name).to(target.dtype).clone())
     except SafetensorError as error:
         raise ValueError(f"{path} is truncated or no safetensors file ({error}); copy or download it again.") from error
 

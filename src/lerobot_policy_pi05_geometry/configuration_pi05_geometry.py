@@ -99,6 +99,9 @@ class PI05GeometryConfig(PreTrainedConfig):
     image_resolution: tuple[int, int] = (224, 224)
     empty_cameras: int = 0
     absent_cameras: list[str] = field(default_factory=list)  # RGB keys that observations may lack
+    optional_cameras: dict[str, PolicyFeature] = field(
+        default_factory=dict
+    )  # empty and absent ones, set by validate_features
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -161,7 +164,7 @@ class PI05GeometryConfig(PreTrainedConfig):
                         f"geometry_placement=prefix puts geometry among the VLM's own tokens, where {name} has no meaning; "
                         f"leave it at {value}."
                     )
-        if self.max_depth <= MIN_DEPTH:
+        if not self.max_depth > MIN_DEPTH:
             raise ValueError(f"max_depth must be above {MIN_DEPTH} m, got {self.max_depth}.")
         if self.image_resolution[0] != self.image_resolution[1]:
             raise ValueError(f"image_resolution must be square, got {tuple(self.image_resolution)}.")
@@ -196,24 +199,29 @@ class PI05GeometryConfig(PreTrainedConfig):
         for key, feature in features.items():
             info = feature.get("info") or {}
             depth = info.get("is_depth_map") or info.get("video.is_depth_map")
-            if depth and not key.endswith(DEPTH_SUFFIX):
+            if depth and not is_geometry_key(key):
                 logger.warning(
                     "Dataset feature %s is a depth map, but its name does not end in '%s', by which the policy finds the "
                     "depth of a camera; rename it to %s.<camera>%s.", key, DEPTH_SUFFIX, OBS_IMAGES, DEPTH_SUFFIX,
                 )  # fmt: skip
 
     def validate_features(self) -> None:
-        """Complete the features, and move depth and calibration out of `input_features`.
+        """Complete the features, and move depth, calibration and cameras that may be absent out of `input_features`.
 
         LeRobot types a depth map as VISUAL and a camera matrix as STATE; left there, the one would reach SigLIP and the
-        other the normaliser.
+        other the normaliser. It also wants the data's visual features to be a subset of the policy's, or the other way
+        round, which depth in the data and an empty camera in the policy would both break.
         """
         inputs = dict(self.input_features or {})
         for key in list(inputs):
             if is_geometry_key(key):
                 self.geometry_features[key] = inputs.pop(key)
         for i in range(self.empty_cameras):
-            inputs[f"{EMPTY_CAMERA}{i}"] = PolicyFeature(type=FeatureType.VISUAL, shape=(3, *self.image_resolution))
+            shape = (3, *self.image_resolution)
+            self.optional_cameras[f"{EMPTY_CAMERA}{i}"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
+        for key in self.absent_cameras:
+            if key in inputs:
+                self.optional_cameras[key] = inputs.pop(key)
         if OBS_STATE not in inputs:
             inputs[OBS_STATE] = PolicyFeature(type=FeatureType.STATE, shape=(self.max_state_dim,))
         self.input_features = inputs
@@ -243,6 +251,11 @@ class PI05GeometryConfig(PreTrainedConfig):
                 f"{', '.join(sorted(found)) or 'no camera'} only (keys {prefix}<camera>{DEPTH_SUFFIX})."
             )
         return {camera: found[camera] for camera in self.geometry_cameras}
+
+    @property
+    def image_features(self) -> dict[str, PolicyFeature]:
+        """RGB cameras, those that may be absent last."""
+        return {**super().image_features, **self.optional_cameras}
 
     def may_be_absent(self, image_key: str) -> bool:
         """Whether observations may lack this RGB camera."""

@@ -79,6 +79,10 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         sizes = config.depth_cameras()
         if config.geometry_source == "random":
             cameras = tuple(sizes) or tuple(key.rsplit(".", 1)[-1] for key in config.image_features)
+            if not cameras:
+                raise ValueError(
+                    "geometry_source=random makes tokens per camera, but the data has none; use geometry_source=none."
+                )
             return RandomSource(cameras, config.geometry_grid)
         if not sizes:
             raise ValueError(

@@ -66,8 +66,8 @@ def discretise_state(state: Tensor) -> Tensor:
             f"{OBS_STATE}[{dim}] is {state[row, dim].item()} in sample {row} of the batch; a sensor that fails must not "
             "steer the robot, so fix the source or drop the frame."
         )
-    bins = torch.floor((state.cpu().double().clamp(-1.0, 1.0) + 1.0) * (STATE_BINS / 2))
-    return bins.clamp(max=STATE_BINS - 1).long()
+    edges = torch.linspace(-1.0, 1.0, STATE_BINS + 1, dtype=torch.float64)[:-1]
+    return torch.bucketize(state.cpu().double().clamp(-1.0, 1.0), edges, right=True) - 1
 
 
 def make_prompt(task: str, bins: list[int]) -> str:
@@ -191,7 +191,10 @@ def build_small_tokenizer() -> PreTrainedTokenizerFast:
 
 def check_vocabulary(step: PortableTokenizerProcessorStep, vocab_size: int) -> None:
     """Raise ValueError if the tokenizer has ids that the network has no embedding for."""
-    largest = max(step.loaded().get_vocab().values(), default=0)
+    tokenizer = step.loaded()
+    # PaliGemma's <image> has an id one past its embeddings; special added tokens never stand in a prompt.
+    special = {index for index, token in tokenizer.added_tokens_decoder.items() if token.special}
+    largest = max((index for index in tokenizer.get_vocab().values() if index not in special), default=0)
     if largest >= vocab_size:
         raise ValueError(
             f"Tokenizer {step.tokenizer_name} has token ids up to {largest}, but the network embeds {vocab_size}; choose "

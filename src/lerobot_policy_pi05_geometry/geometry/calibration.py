@@ -26,7 +26,7 @@ def read_calibration_file(path: str | Path) -> dict[str, CameraCalibration]:
         )
     try:
         content = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"Calibration file {path} is no JSON: {error}.") from error
     if (
         not isinstance(content, dict)
@@ -54,8 +54,8 @@ def read_calibration_file(path: str | Path) -> dict[str, CameraCalibration]:
             if camera.extrinsics is not None and [len(row) for row in camera.extrinsics] != [4, 4, 4, 4]:
                 raise ValueError(f"Extrinsics of camera '{name}' must be 4 rows of 4 numbers.")
             camera.check(name)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"Camera '{name}' in {path}: {error}") from error
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"Camera '{name}' in {path}: {str(error).rstrip('.')}.") from error
         cameras[name] = camera
     return cameras
 
