@@ -40,9 +40,9 @@ class DemoSettings:
     learning_rate: float = 2e-3
     flow_samples: int = 4
     chunk_size: int = 8
-    action_steps: int = 4
+    action_steps: int = 2
     image_size: int = 84
-    evaluation_episodes: int = 50
+    evaluation_episodes: int = 40
     parallel: int = 10
     videos: int = 3
     seed: int = 0
