@@ -63,7 +63,7 @@ def depth_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Fig
         if depth_key(camera) in batch:
             raw = batch[depth_key(camera)][:1].cpu()
             depth, valid = to_metres(raw, camera, policy.config.depth_unit, size, policy.config.max_depth)
-            shown = np.where(valid[0, 0].numpy(), depth[0, 0].numpy(), np.nan)
+            shown[:] = np.where(valid[0, 0].numpy(), depth[0, 0].numpy(), np.nan)
         if rgb is not None:
             row[0].imshow(rgb)
         row[0].set_title(f"{camera}: RGB, what the VLM sees")
