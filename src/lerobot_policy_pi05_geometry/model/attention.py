@@ -1,8 +1,8 @@
 """Attention in one function, for every query of the network.
 
 Two ways to compute the same thing. `scaled_dot_product_attention` is the default. It falls back to its slow path when
-the mask needs a gradient, which the suffix's does while the gate is trained, and on a CPU its backward is slower than
-two matrix products at small sizes; there the products are written out. benchmarks/attention.py measures both.
+the mask needs a gradient, which the suffix's does while the gate is trained; there, and in training on a CPU, two matrix
+products and a softmax are written out. benchmarks/attention.py measures both (docs/results.md).
 
 Shapes: B batch, H query heads, KV key/value heads, Q queries, K keys, D head_dim.
 """
