@@ -28,10 +28,7 @@ from lerobot_policy_pi05_geometry.model.precision import Float32Module, compute_
 from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 
 ARMS = ("geometry", "no geometry", "lerobot")
-PARTS = ("prefix", "denoise step", "chunk")
-PROMPT = (
-    48  # tokens of a typical prompt with 32 state numbers would be some 120; a short one is where padding costs most
-)
+PARTS = ("prefix", "geometry", "denoise step", "chunk")
 
 
 @contextmanager
