@@ -59,7 +59,7 @@ def demo(
 ) -> None:
     """Record a simulated RGB-D task, train with and without geometry, evaluate both, and write a report.
 
-    Everything happens on this machine's CPU, in some 15 minutes on two cores. An interrupted demo goes on where it
+    Everything happens on this machine's CPU, in some 15 to 20 minutes on two cores. An interrupted demo goes on where it
     stopped when it is started again. The report is report.html in the output folder.
     """
     _require_simulator()

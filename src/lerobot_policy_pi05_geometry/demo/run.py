@@ -29,7 +29,7 @@ _STATE_ONLY = '{"observation.state": {"type": "STATE", "shape": [4]}}'
 
 @dataclass(frozen=True)
 class DemoSettings:
-    """What the demo does. The defaults end within 15 minutes on two cores."""
+    """What the demo does. docs/results.md says how long the defaults took."""
 
     task: str = "button-press-topdown-wide"
     variant: str = "small"
@@ -40,9 +40,9 @@ class DemoSettings:
     learning_rate: float = 2e-3
     flow_samples: int = 4
     chunk_size: int = 8
-    action_steps: int = 2
+    action_steps: int = 4
     image_size: int = 84
-    evaluation_episodes: int = 40
+    evaluation_episodes: int = 50
     parallel: int = 10
     videos: int = 3
     seed: int = 0
