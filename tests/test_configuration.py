@@ -215,7 +215,6 @@ def test_an_unknown_choice_is_refused_with_those_there_are(name, value, known):
         ({"max_depth": 0.02}, "max_depth must be above 0.02 m, got 0.02"),
         ({"max_depth": float("nan")}, "max_depth"),
         ({"flow_samples": 0}, "flow_samples must be at least 1"),
-        ({"flow_samples": 2, "geometry_time": "denoise"}, "use geometry_time=clean"),
         ({"n_obs_steps": 2}, "n_obs_steps must be 1, got 2"),
         ({"geometry_cameras": []}, "geometry_cameras is empty"),
         ({"geometry_placement": "prefix", "geometry_time": "denoise"}, "geometry_time has no meaning"),

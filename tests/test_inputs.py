@@ -110,6 +110,17 @@ def test_a_constant_dimension_is_only_reported(caplog):
     assert record.getMessage() == f"{STATE}[0] is constant (0.5) in the dataset; it carries no information."
 
 
+def test_a_state_that_would_mostly_be_clipped_is_reported(caplog):
+    caplog.set_level(logging.WARNING)
+    low, high = [-1.0, *[-2.0] * 6], [1.0, *[2.0] * 6]
+    check(stats_with(STATE, min=[-3.1, *[-2.0] * 6], max=high))
+    assert "observation.state[0] span less than half" in caplog.text
+    assert "pi05-geometry quantiles" in caplog.text
+    caplog.clear()
+    check(stats_with(STATE, min=low, max=high))
+    assert not caplog.records
+
+
 @pytest.mark.parametrize("mode", [NormalizationMode.MEAN_STD, NormalizationMode.MIN_MAX, NormalizationMode.IDENTITY])
 def test_other_normalisations_need_no_quantiles(mode):
     check({STATE: {}, "action": {}}, normalization_mapping={"STATE": mode, "ACTION": mode})

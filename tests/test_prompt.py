@@ -16,8 +16,10 @@ from lerobot.processor import PolicyProcessorPipeline
 from tokenizers import AddedToken, Tokenizer, models, pre_tokenizers
 from transformers import PreTrainedTokenizerFast
 
+from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from lerobot_policy_pi05_geometry.prompt import (
     SMALL_TOKENIZER,
+    STATE_BINS,
     PortableTokenizerProcessorStep,
     PromptProcessorStep,
     build_small_tokenizer,
@@ -25,6 +27,7 @@ from lerobot_policy_pi05_geometry.prompt import (
     discretise_state,
     make_prompt,
     read_tokenizer_files,
+    small_number_ids,
 )
 from tests.doors import STATE, TOKEN_MASK, TOKENS, make_config, make_observation, make_processors
 
@@ -277,3 +280,19 @@ def test_a_tokenizer_that_just_fits_is_taken(tmp_path, kind):
     make_other_tokenizer(1024, kind).save_pretrained(tmp_path / "fits")
     step = PortableTokenizerProcessorStep(tokenizer_name=str(tmp_path / "fits"))
     check_vocabulary(step, 1024)
+
+
+def test_numbers_start_in_order_for_a_vocabulary_that_nobody_trained():
+    """Neighbouring numbers are alike, distant ones are not, and every number is as long as other tokens are on average."""
+    ids = small_number_ids()
+    tokenizer = build_small_tokenizer()
+    assert [tokenizer.decode([i]).strip() for i in ids] == [str(n) for n in range(STATE_BINS)]
+    policy = PI05GeometryPolicy(make_config(paligemma_variant="small", action_expert_variant="small"))
+    table = policy.model.paligemma_with_expert.language_model.embed_tokens.weight.detach()
+    numbers = table[torch.tensor(ids)]
+    alike = numbers @ numbers.T
+    assert torch.allclose(alike.diagonal(), torch.ones(STATE_BINS), atol=1e-5)
+    assert alike.diagonal(offset=1).min() > 0.9
+    assert alike.diagonal(offset=100).max() < 0.6
+    others = torch.ones(len(table), dtype=torch.bool).index_fill(0, torch.tensor(ids), False)
+    assert 0.9 < table[others].norm(dim=1).mean() < 1.1

@@ -5,8 +5,9 @@ import os
 import sys
 import time
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 os.environ.setdefault("TQDM_DISABLE", "1")  # LeRobot's bars would draw over ours
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
@@ -17,7 +18,6 @@ from rich.logging import RichHandler
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     TaskID,
     TextColumn,
@@ -25,21 +25,29 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+if TYPE_CHECKING:
+    from .study.launch import Progress as StudyProgress
+    from .study.runs import Run
+
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
 console = Console()
 
 Output = Annotated[Path, typer.Option(help="Folder for everything this writes.")]
 Task = Annotated[
-    str, typer.Option(help="Simulated task: button-press-topdown-wide, faucet-open-wide, or any Meta-World v3 name.")
+    str,
+    typer.Option(
+        help="Simulated task: button-press-topdown-wide, faucet-open-wide, coffee-button-wide, or any Meta-World v3 name."
+    ),
 ]
 Cameras = Annotated[str, typer.Option(help="Range of camera poses: fixed, train, outside, far or wide.")]
+Sensor = Annotated[str, typer.Option(help="Depth sensor: ideal, noisy, off, calibration-1, -2 or -5.")]
 
 
 def _bars() -> Progress:
     return Progress(
-        TextColumn("{task.description:<28}"),
+        TextColumn("{task.description:<48}"),
         BarColumn(bar_width=30),
-        MofNCompleteColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         console=console,
@@ -52,38 +60,134 @@ def _require_simulator() -> None:
     require_simulator()
 
 
+Workers = Annotated[int | None, typer.Option(help="Runs at once; one per core if left out.")]
+
+
 @app.command()
 def demo(
     output: Output = Path("demo"),
-    minimal: Annotated[bool, typer.Option(help="Every step at the smallest size, to see that it works.")] = False,
+    workers: Workers = None,
 ) -> None:
-    """Record a simulated RGB-D task, train with and without geometry, evaluate both, and write a report.
+    """Record a simulated RGB-D task, train with and without geometry, evaluate both and a blind floor, write a report.
 
-    Everything happens on this machine's CPU, in some 15 to 20 minutes on two cores. An interrupted demo goes on where it
-    stopped when it is started again. The report is report.html in the output folder.
+    Everything happens on this machine's CPU. An interrupted demo goes on where it stopped when it is started again. The
+    report is report.html in the output folder.
     """
-    _require_simulator()
-    from .demo.report import write_report
-    from .demo.run import DemoSettings, run_demo
-
-    settings = DemoSettings()
-    if minimal:
-        settings = DemoSettings(
-            variant="tiny", episodes=2, steps=4, blind_steps=2, batch_size=4, image_size=28, evaluation_episodes=2,
-            parallel=2, videos=1,
-        )  # fmt: skip
     start = time.monotonic()
-    with _bars() as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def progress(name: str, done: int, total: int) -> None:
-            if name not in tasks:
-                tasks[name] = bars.add_task(name, total=total)
-            bars.update(tasks[name], completed=done)
-
-        results = run_demo(output, settings, progress)
-    path = write_report(output, settings, results)
+    path = _simulated_study("demo", output, workers, retry_crashed=True, command="pi05-geometry demo")
     console.print(f"Done in {(time.monotonic() - start) / 60:.1f} minutes. Open [bold]{path}[/bold]")
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def study(
+    context: typer.Context,
+    spec: Annotated[
+        str, typer.Option(help="A study's TOML file, or one that comes along: default, demo, smoke.")
+    ] = "default",
+    output: Output = Path("study"),
+    workers: Workers = None,
+    smoke: Annotated[bool, typer.Option("--smoke", help="Every step at the smallest size: --spec smoke.")] = False,
+    retry_crashed: Annotated[bool, typer.Option("--retry-crashed", help="Try runs again that crashed before.")] = False,
+    dataset_root: Annotated[
+        Path | None, typer.Option("--dataset.root", help="Your own LeRobotDataset instead of the simulator.")
+    ] = None,
+    dataset_repo_id: Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")] = "local/dataset",
+    arms: Annotated[str, typer.Option(help="Own data: arms, with commas.")] = "blind,rgb,random,geometry",
+    seeds: Annotated[str, typer.Option(help="Own data: training seeds, with commas.")] = "0,1,2",
+    steps: Annotated[int, typer.Option(help="Own data: training steps of every run.")] = 3000,
+    held_out: Annotated[float, typer.Option(help="Own data: share of the episodes to evaluate on.")] = 0.2,
+    frames: Annotated[int, typer.Option(help="Own data: frames to evaluate of each held-out episode.")] = 20,
+) -> None:
+    """Does geometry help? Train and evaluate every arm of a study, and write its report.
+
+    A study is tasks x arms x training seeds x conditions. Killed and started again it goes on where it stopped; finished
+    runs are kept by what they depend on. Over several machines that share the output folder: start it with torchrun on
+    each (`torchrun --nnodes 2 --nproc-per-node 4 --no-python pi05-geometry study --workers 1 ...`).
+
+    With --dataset.root it runs on your own data: trained on most episodes, its action error measured on the others. All
+    further options go to lerobot-train (`--policy.dtype=bfloat16 --policy.device=cuda --batch_size=8`).
+    """
+    if dataset_root is None:
+        if context.args:
+            raise ValueError(f"{context.args[0]} is no option of a simulated study; put the budget into a --spec file.")
+        name = "smoke" if smoke else spec
+        command = f"pi05-geometry study --spec {name} --output {output}"
+        path = _simulated_study(name, output, workers, retry_crashed, command)
+    else:
+        from .study.held_out import held_out_runs
+        from .study.held_out_report import write_held_out_report
+
+        options = _forwarded(context.args)
+        numbers = [int(seed) for seed in seeds.split(",")]
+        runs = held_out_runs(
+            output, dataset_root, dataset_repo_id, arms.split(","), numbers, options, steps, held_out, frames
+        )
+        if workers is None and options.get("policy.device", "cpu") != "cpu":
+            workers = 1  # one run at a time on an accelerator
+        _carry_out(runs, workers, retry_crashed)
+        command = " ".join(["pi05-geometry study", f"--dataset.root={dataset_root}", *context.args])
+        path = write_held_out_report(output, runs, command) if _complete(runs) else None
+    if path is not None:
+        console.print(f"Open [bold]{path}[/bold]")
+
+
+def _forwarded(arguments: list[str]) -> dict[str, str]:
+    """Options for lerobot-train, as name and value."""
+    options = {}
+    for argument in arguments:
+        name, separator, value = argument.removeprefix("--").partition("=")
+        if not argument.startswith("--") or not separator:
+            raise ValueError(f"Options for lerobot-train are written --name=value, got '{argument}'.")
+        options[name] = value
+    return options
+
+
+def _simulated_study(name: str, output: Path, workers: int | None, retry_crashed: bool, command: str) -> Path | None:
+    """Carry out this process's share of a simulated study; write the report if nothing is left to do."""
+    _require_simulator()
+    from .study.report import write_report
+    from .study.simulated import runs_of
+    from .study.spec import read_spec
+
+    runs = runs_of(read_spec(name), output)
+    _carry_out(runs, workers, retry_crashed)
+    return write_report(output, runs, command) if _complete(runs) else None
+
+
+def _carry_out(runs: "Sequence[Run]", workers: int | None, retry_crashed: bool) -> None:
+    from .study.launch import default_workers, launch, share
+
+    with _bars() as bars:
+        launch(share(runs), workers or default_workers(), _study_progress(bars), retry_crashed)
+
+
+def _complete(runs: "Sequence[Run]") -> bool:
+    """Whether nothing is left to do; says which runs crashed."""
+    crashed = [run for run in runs if run.crash.exists()]
+    for run in crashed:
+        console.print(f"[bold red]Crashed[/bold red] {run.name}: see {escape(str(run.log))}", soft_wrap=True)
+    if any(run.missing() for run in runs if run not in crashed):
+        console.print("This process's runs are done; the one that finishes last writes the report.")
+        return False
+    return True
+
+
+def _study_progress(bars: Progress) -> "Callable[[StudyProgress], None]":
+    """A bar for the whole study, and one for each run under way."""
+    whole = bars.add_task("all runs", total=None)
+    shown: dict[str, TaskID] = {}
+
+    def update(progress: "StudyProgress") -> None:
+        bars.update(whole, completed=progress.done, total=progress.total)
+        under_way = {job.run.name: job for job in progress.jobs}
+        for name in set(shown) - set(under_way):
+            bars.remove_task(shown.pop(name))
+        for name, job in under_way.items():
+            if name not in shown:
+                shown[name] = bars.add_task(name, total=None)
+            bars.update(shown[name], description=f"{name}: {job.stage}", completed=job.done, total=job.total or None)
+
+    return update
 
 
 @app.command()
@@ -112,7 +216,7 @@ def record(
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
 def train(context: typer.Context) -> None:
     """lerobot-train with decoded frames kept in memory; takes its arguments. For datasets that fit."""
-    from .demo.frames_in_memory import train_in_memory
+    from .study.frames_in_memory import train_in_memory
 
     sys.argv = ["lerobot-train", *context.args]  # LeRobot parses the command line itself
     train_in_memory()
@@ -123,7 +227,9 @@ def evaluate(
     checkpoint: Annotated[str, typer.Argument(help="Checkpoint folder (pretrained_model) or hub id.")],
     task: Task = "button-press-topdown-wide",
     cameras: Cameras = "train",
-    episodes: Annotated[int, typer.Option(help="Episodes, on seeds 0, 1, ...")] = 50,
+    sensor: Sensor = "ideal",
+    episodes: Annotated[int, typer.Option(help="Episodes to run.")] = 50,
+    first_seed: Annotated[int, typer.Option(help="Seed of the first episode; the others follow.")] = 0,
     image_size: Annotated[int, typer.Option(help="Pixels per side; as in training.")] = 84,
     device: Annotated[str, typer.Option(help="Where the policy runs.")] = "cpu",
     output: Annotated[Path | None, typer.Option(help="Write the outcome of every episode to this JSON file.")] = None,
@@ -136,15 +242,27 @@ def evaluate(
     from .sim.configuration import MetaworldRgbdEnv
     from .sim.evaluate import evaluate as run
 
-    environment = MetaworldRgbdEnv(task=task, cameras=cameras, image_size=image_size)
+    environment = MetaworldRgbdEnv(task=task, cameras=cameras, sensor=sensor, image_size=image_size)
     loaded = load_policy(checkpoint, device, environment)
     with _bars() as bars:
         bar = bars.add_task(f"{task}, {cameras}", total=episodes)
-        result = run(loaded, environment, episodes, progress=lambda done: bars.update(bar, completed=done))
+        result = run(loaded, environment, episodes, first_seed, progress=lambda done: bars.update(bar, completed=done))
     low, high = result.interval()
     console.print(f"{result.rate:.0%} of {episodes} episodes succeed (95 % interval {low:.0%} to {high:.0%}).")
     if output is not None:
         output.write_text(json.dumps(result.to_json(), indent=2))
+
+
+@app.command()
+def quantiles(
+    dataset_root: Annotated[Path, typer.Option("--dataset.root", help="Folder of a LeRobotDataset.")],
+) -> None:
+    """Recompute a dataset's state and action quantiles over all frames (LeRobot averages those of single episodes)."""
+    from .quantiles import write_frame_quantiles
+
+    for key, shares in write_frame_quantiles(dataset_root).items():
+        told = " -> ".join(" ".join(f"{share:.0%}" for share in row) for row in shares)
+        console.print(f"{key}: q01 to q99 covers of min to max, per dimension: {told}")
 
 
 @app.command()

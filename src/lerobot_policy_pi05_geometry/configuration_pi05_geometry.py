@@ -22,6 +22,7 @@ from .model.config import (
 )
 from .model.precision import DTYPES
 from .model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
+from .prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +84,9 @@ class PI05GeometryConfig(PreTrainedConfig):
     tokenizer_max_length: int = 200
 
     num_inference_steps: int = 10
-    flow_samples: int = 1  # noises and flow times per training sample; they share one pass over prefix and geometry
+    flow_samples: int = (
+        1  # noises and flow times per training sample; they share one pass over prefix and (clean) geometry
+    )
     time_sampling_beta_alpha: float = 1.5
     time_sampling_beta_beta: float = 1.0
     time_sampling_scale: float = 0.999
@@ -151,11 +154,6 @@ class PI05GeometryConfig(PreTrainedConfig):
             raise ValueError(f"n_action_steps ({self.n_action_steps}) must not exceed chunk_size ({self.chunk_size}).")
         if not 0 <= self.geometry_dropout < 1:
             raise ValueError(f"geometry_dropout must be in [0, 1), got {self.geometry_dropout}.")
-        if self.flow_samples > 1 and self.geometry_time == "denoise" and self.geometry_source != "none":
-            raise ValueError(
-                "flow_samples above 1 share one geometry segment, which geometry_time=denoise ties to a single flow time; "
-                "use geometry_time=clean."
-            )
         if self.geometry_placement == "prefix":
             fixed = {"geometry_time": "clean", "geometry_positions": "sequential", "geometry_expert": "shared"}
             for name, value in {**fixed, "geometry_gate_init": 0.0}.items():
@@ -251,6 +249,12 @@ class PI05GeometryConfig(PreTrainedConfig):
                 f"{', '.join(sorted(found)) or 'no camera'} only (keys {prefix}<camera>{DEPTH_SUFFIX})."
             )
         return {camera: found[camera] for camera in self.geometry_cameras}
+
+    @property
+    def tokenizer(self) -> str:
+        """Folder or hub id of the tokenizer, or "built-in"."""
+        released = self.paligemma_variant == "gemma_2b"
+        return self.tokenizer_path or (PALIGEMMA_TOKENIZER if released else SMALL_TOKENIZER)
 
     @property
     def image_features(self) -> dict[str, PolicyFeature]:

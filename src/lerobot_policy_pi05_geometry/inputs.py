@@ -15,6 +15,7 @@ from .configuration_pi05_geometry import PI05GeometryConfig
 from .geometry import CameraCalibration, read_calibration_file
 from .geometry.calibration import CALIBRATION_FILE
 from .geometry.keys import extrinsics_key
+from .quantiles import WIDE_ENOUGH, covered
 
 logger = logging.getLogger(__name__)
 
@@ -64,7 +65,7 @@ def check_stats(config: PI05GeometryConfig, stats: Mapping[str, Mapping[str, Any
     """Check that the dataset statistics can normalise what `normalization_mapping` wants normalised.
 
     LeRobot divides by an epsilon where two quantiles coincide, which turns any other value into millions. A dimension
-    that is constant throughout is harmless and only reported.
+    that is constant throughout is harmless and only reported; so is a state whose quantiles cover little of its range.
 
     Raises ValueError naming the feature, the dimension and what to do.
     """
@@ -90,10 +91,22 @@ def check_stats(config: PI05GeometryConfig, stats: Mapping[str, Mapping[str, Any
                 )
                 continue
             raise ValueError(
-                f"{key}[{dim}] has {low_name} = {high_name} = {low[dim].item():g} although it is not constant, so its "
-                f"{mode.value} normalisation has no width; drop the dimension, or use MEAN_STD or MIN_MAX in "
+                f"{key}[{dim}] has {low_name} = {low[dim].item():g} and {high_name} = {high[dim].item():g} although it is not "
+                f"constant, so its {mode.value} normalisation has no width; drop the dimension, or use MEAN_STD or MIN_MAX in "
                 "--policy.normalization_mapping."
             )
+        if key == OBS_STATE and {"min", "max"} <= set(stats[key]):
+            narrow = (covered(stats[key], low_name, high_name) < WIDE_ENOUGH).nonzero()[0].tolist()
+            _warn_of_narrow_quantiles(narrow)
+
+
+def _warn_of_narrow_quantiles(narrow: list[int]) -> None:
+    if narrow:
+        logger.warning(
+            "The quantiles of %s%s span less than half of its range, and what lies outside them is clipped in the prompt. "
+            "LeRobot averages the quantiles of single episodes; `pi05-geometry quantiles --dataset.root=...` takes them "
+            "over all frames.", OBS_STATE, narrow,
+        )  # fmt: skip
 
 
 def resolve_calibration(config: PI05GeometryConfig, dataset_meta: Any | None) -> dict[str, CameraCalibration]:

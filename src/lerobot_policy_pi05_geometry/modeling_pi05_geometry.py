@@ -31,6 +31,7 @@ from .geometry.rgbd import RgbdSource
 from .inputs import check_calibration, check_stats, prepare_images, resolve_calibration
 from .model import PI05Pytorch
 from .model.flow import FlowDraw, draw_flow
+from .prompt import SMALL_TOKENIZER, small_number_ids
 
 logger = logging.getLogger(__name__)
 
@@ -60,6 +61,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self.model = PI05Pytorch(config.network(), self.rtc_processor)
         source = self._build_source(dataset_meta)
         self.geometry = None if source is None else GeometryEncoder(source, self.model.geometry_width)
+        if config.tokenizer == SMALL_TOKENIZER and not self.model.action_in_proj.weight.is_meta:
+            self.model.paligemma_with_expert.language_model.start_numbers_in_order(small_number_ids())
         self._set_trainable()
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()

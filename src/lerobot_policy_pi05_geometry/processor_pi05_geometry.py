@@ -19,13 +19,7 @@ from lerobot.processor import (
 from .configuration_pi05_geometry import PI05GeometryConfig
 from .inputs import check_stats
 from .model.variants import PALIGEMMA_VARIANTS
-from .prompt import (
-    PALIGEMMA_TOKENIZER,
-    SMALL_TOKENIZER,
-    PortableTokenizerProcessorStep,
-    PromptProcessorStep,
-    check_vocabulary,
-)
+from .prompt import PortableTokenizerProcessorStep, PromptProcessorStep, check_vocabulary
 
 
 def make_pi05_geometry_pre_post_processors(
@@ -42,11 +36,7 @@ def make_pi05_geometry_pre_post_processors(
     config.validate_features()  # depth and poses must not reach the normaliser, whoever builds processors first
     if dataset_stats:
         check_stats(config, dataset_stats)
-    small = config.paligemma_variant != "gemma_2b"
-    tokenizer = PortableTokenizerProcessorStep(
-        tokenizer_name=config.tokenizer_path or (SMALL_TOKENIZER if small else PALIGEMMA_TOKENIZER),
-        max_length=config.tokenizer_max_length,
-    )
+    tokenizer = PortableTokenizerProcessorStep(tokenizer_name=config.tokenizer, max_length=config.tokenizer_max_length)
     check_vocabulary(tokenizer, PALIGEMMA_VARIANTS[config.paligemma_variant].vocab_size)
     relative = RelativeActionsProcessorStep(
         enabled=config.use_relative_actions,

@@ -3,6 +3,7 @@
 import logging
 import tempfile
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +188,13 @@ def build_small_tokenizer() -> PreTrainedTokenizerFast:
     return PreTrainedTokenizerFast(
         tokenizer_object=tokenizer, pad_token="<pad>", eos_token="<eos>", bos_token="<bos>", padding_side="right"
     )
+
+
+@cache
+def small_number_ids() -> tuple[int, ...]:
+    """Ids of the numbers 0..255 in the built-in tokenizer, as they stand in a prompt: each is one token."""
+    tokenizer = build_small_tokenizer()
+    return tuple(tokenizer.encode(f" {number}", add_special_tokens=False)[0] for number in range(STATE_BINS))
 
 
 def check_vocabulary(step: PortableTokenizerProcessorStep, vocab_size: int) -> None:

@@ -335,7 +335,7 @@ def test_the_loss_is_that_of_the_flow() -> None:
     assert loss.dtype == torch.float32
 
 
-@pytest.mark.parametrize("geometry", [None, SEGMENT, PARALLEL, IN_PREFIX, OWN_EXPERT], ids=name_of)
+@pytest.mark.parametrize("geometry", [None, SEGMENT, PARALLEL, DENOISE, IN_PREFIX, OWN_EXPERT], ids=name_of)
 @given(case=cases, samples=st.integers(1, 4))
 @settings(max_examples=4)
 def test_flow_samples_are_blind_to_each_other(geometry: GeometrySegmentConfig | None, case: Case, samples: int) -> None:
@@ -350,15 +350,6 @@ def test_flow_samples_are_blind_to_each_other(geometry: GeometrySegmentConfig | 
     assert together.shape == noise.shape
     alone = [network(*batch._replace(noise=noise[:, k], time=time[:, k])) for k in range(samples)]
     assert_near(list(together.unbind(1)), alone)
-
-
-def test_flow_samples_need_one_geometry() -> None:
-    """Under "denoise" geometry follows one flow time, so it cannot serve several."""
-    network = shared_network(DENOISE)
-    batch = Case().draw(network.geometry_width)
-    noise, time = batch.noise[:, None].expand(-1, 2, -1, -1), batch.time[:, None].expand(-1, 2)
-    with pytest.raises(ValueError, match="geometry_time='denoise' has no one time"):
-        network(*batch._replace(noise=noise, time=time))
 
 
 @pytest.mark.parametrize("geometry", [SEGMENT, PARALLEL, DENOISE], ids=name_of)

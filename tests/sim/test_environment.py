@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_policy_pi05_geometry.geometry.calibration import read_calibration_file
 from lerobot_policy_pi05_geometry.geometry.camera import check_rigid, transform, unproject
+from lerobot_policy_pi05_geometry.quantiles import write_frame_quantiles
 from lerobot_policy_pi05_geometry.sim.cameras import CAMERA_RANGES, LOOK_AT
 from lerobot_policy_pi05_geometry.sim.configuration import MetaworldRgbdEnv
 from lerobot_policy_pi05_geometry.sim.environment import CAMERA, DEPTH_KEY, EXTRINSICS_KEY, RgbdMetaworldEnv
@@ -286,6 +288,37 @@ def test_what_is_recorded_is_what_the_environment_showed(recorded):
     assert np.array_equal(pixels, seen["pixels"]["front"])
 
 
+def test_quantiles_are_those_of_all_frames(recorded):
+    """Not the mean of the episodes' own, which is what LeRobot writes (to within its histogram's bins)."""
+    dataset = LeRobotDataset("local/two", root=recorded[0])
+    for key in ("observation.state", "action"):
+        frames, stats = np.stack(dataset.hf_dataset[key]), dataset.meta.stats[key]
+        spread = stats["max"] - stats["min"] + 1e-9
+        order = np.sort(frames, axis=0)
+        for name, share in (("q01", 0.01), ("q50", 0.5), ("q99", 0.99)):
+            rank = share * (len(frames) - 1)
+            below, above = order[max(int(rank) - 1, 0)], order[min(int(rank) + 2, len(frames) - 1)]
+            assert (stats[name] >= below - 0.002 * spread).all(), (key, name)
+            assert (stats[name] <= above + 0.002 * spread).all(), (key, name)
+        assert np.array_equal(stats["min"], frames.min(axis=0))
+
+
+def test_quantiles_of_a_dataset_can_be_recomputed(recorded, tmp_path):
+    """What LeRobot averaged over episodes is put right, and nothing else is touched."""
+    root = tmp_path / "copy"
+    shutil.copytree(recorded[0], root)
+    right = json.loads((root / "meta" / "stats.json").read_text())
+    wrong = json.loads(json.dumps(right))
+    wrong["observation.state"]["q99"] = wrong["observation.state"]["q50"]
+    (root / "meta" / "stats.json").write_text(json.dumps(wrong))
+    before, after = write_frame_quantiles(root)["observation.state"]
+    assert (before <= after).all()
+    assert (before < after).any()
+    assert json.loads((root / "meta" / "stats.json").read_text()) == right
+    with pytest.raises(FileNotFoundError, match=r"holds no LeRobotDataset"):
+        write_frame_quantiles(tmp_path / "nowhere")
+
+
 def test_a_recording_brings_its_calibration(recorded):
     root, _ = recorded
     camera = read_calibration_file(root / "meta" / "calibration.json")["front"]
@@ -317,3 +350,31 @@ def test_features_are_typed_as_lerobot_types_them():
     types = {key: feature.type for key, feature in MetaworldRgbdEnv().features.items()}
     assert types["images.front_depth"] == FeatureType.VISUAL
     assert types["calibration.front.extrinsics"] == FeatureType.STATE
+
+
+@pytest.mark.parametrize("sensor", ["noisy", "off", "calibration-5"])
+def test_a_sensor_changes_what_is_measured_and_nothing_else(sensor):
+    """Same seed, same scene, same RGB: only depth, or only the reported pose, differs."""
+    ideal, faulty = (RgbdMetaworldEnv("button-press-topdown-wide", "outside", 28, sensor=s) for s in ("ideal", sensor))
+    try:
+        first, _ = ideal.reset(seed=5)
+        second, _ = faulty.reset(seed=5)
+        for _ in range(2):
+            differs = {
+                "depth": (first[DEPTH_KEY] != second[DEPTH_KEY]).any(),
+                "pose": (first[EXTRINSICS_KEY] != second[EXTRINSICS_KEY]).any(),
+                "rgb": (first["pixels"][CAMERA] != second["pixels"][CAMERA]).any(),
+                "state": (first["agent_pos"] != second["agent_pos"]).any(),
+            }
+            wrong_pose = sensor.startswith("calibration")
+            assert differs == {"depth": not wrong_pose, "pose": wrong_pose, "rgb": False, "state": False}
+            first, *_ = ideal.step(np.array([0.5, -0.5, 0.2, 1.0]))
+            second, *_ = faulty.step(np.array([0.5, -0.5, 0.2, 1.0]))
+    finally:
+        ideal.close()
+        faulty.close()
+
+
+def test_an_unknown_sensor_is_named():
+    with pytest.raises(ValueError, match="no depth sensor 'broken'"):
+        RgbdMetaworldEnv("button-press-topdown-wide", sensor="broken")

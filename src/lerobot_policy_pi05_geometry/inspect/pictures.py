@@ -1,5 +1,6 @@
 """Figures of a policy at work. Each function returns a matplotlib figure; nothing is drawn from what should be."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import matplotlib
@@ -18,7 +19,8 @@ from ..modeling_pi05_geometry import PI05GeometryPolicy
 from .attention import attention_layout, suffix_attention
 
 INK = "#22303c"
-COLOURS = {"geometry": "#0b7285", "rgb": "#e8590c", "blind": "#868e96"}
+COLOURS = {"geometry": "#0b7285", "rgb": "#e8590c", "rgb-wide": "#f59f00", "random": "#ae3ec9", "blind": "#868e96"}
+OTHER = "#74b8c4"  # variants of geometry
 SEGMENT_COLOURS = ("#4263eb", "#0b7285", "#e8590c")
 SEGMENT_NAMES = ("prefix", "geometry", "suffix")
 
@@ -108,25 +110,27 @@ def segment_share_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]
 
 
 def success_figure(conditions: Sequence[str], arms: Mapping[str, Sequence[tuple[float, float, float]]]) -> Figure:
-    """Success rates with intervals. arms: per arm one (rate, low, high) per condition."""
-    figure = Figure(figsize=(7.2, 3.6), layout="constrained")
-    axes = figure.subplots()
-    width = 0.8 / len(arms)
-    for i, (arm, values) in enumerate(arms.items()):
-        rates = np.array(values)
-        x = np.arange(len(conditions)) + (i - (len(arms) - 1) / 2) * width
-        errors = np.abs(rates[:, 1:].T - rates[:, 0])
-        axes.bar(
-            x, rates[:, 0], width * 0.92, color=COLOURS.get(arm, INK), label=arm, yerr=errors, capsize=4, ecolor=INK
-        )
-        for xi, (rate, _, high) in zip(x, rates, strict=True):
-            axes.text(xi, high + 0.03, f"{rate:.0%}", ha="center", color=INK, fontsize=10)
-    axes.set_xticks(range(len(conditions)), conditions)
-    axes.set_ylim(0, 1.18)
-    axes.set_yticks(np.linspace(0, 1, 5), [f"{v:.0%}" for v in np.linspace(0, 1, 5)])
-    axes.set_ylabel("episodes that succeed (95 % interval)")
-    axes.legend(frameon=False, ncols=len(arms), loc="upper center", bbox_to_anchor=(0.5, -0.1))
-    axes.spines[["top", "right"]].set_visible(False)
+    """Success rates with intervals, one panel per condition. arms: per arm one (rate, low, high) per condition."""
+    columns = min(len(conditions), 4)
+    rows = -(-len(conditions) // columns)
+    size = (1.6 + 2.9 * columns, rows * (0.9 + 0.36 * len(arms)))
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False).flat
+    y = np.arange(len(arms))[::-1]
+    for axes, condition, i in zip(panels, conditions, range(len(conditions)), strict=False):
+        for yi, (arm, values) in zip(y, arms.items(), strict=True):
+            rate, low, high = values[i]
+            axes.barh(yi, rate, 0.62, color=COLOURS.get(arm, OTHER))
+            axes.plot([low, high], [yi, yi], color=INK, linewidth=1.4)
+            axes.text(high + 0.02, yi, f"{rate:.0%}", va="center", color=INK, fontsize=9)
+        axes.set_title(textwrap.fill(condition, 30), fontsize=10)
+        axes.set_xlim(0, 1.15)
+        axes.set_xticks(np.linspace(0, 1, 3), [f"{v:.0%}" for v in np.linspace(0, 1, 3)])
+        axes.set_yticks(y, list(arms))
+        axes.spines[["top", "right"]].set_visible(False)
+    for axes in list(panels)[len(conditions) :]:
+        axes.set_visible(False)
+    figure.supxlabel("episodes that succeed, with 95 % intervals", fontsize=10)
     return figure
 
 
@@ -135,10 +139,26 @@ def curves_figure(curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure
     figure = Figure(figsize=(5.2, 3.4), layout="constrained")
     axes = figure.subplots()
     for arm, curve in curves.items():
-        axes.plot(curve["step"], curve["loss"], color=COLOURS.get(arm, INK), label=arm)
+        axes.plot(curve["step"], curve["loss"], color=COLOURS.get(arm), label=arm)
     axes.set_xlabel("training step")
     axes.set_ylabel("flow-matching loss")
     axes.set_yscale("log")
+    axes.legend(frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def horizon_figure(arms: Mapping[str, np.ndarray]) -> Figure:
+    """Error by step ahead. arms: per arm (3, S), mean, low and high."""
+    figure = Figure(figsize=(6.2, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for arm, (mean, low, high) in arms.items():
+        steps = np.arange(1, len(mean) + 1)
+        (line,) = axes.plot(steps, mean, color=COLOURS.get(arm), label=arm, marker="o", markersize=3)
+        axes.fill_between(steps, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+    axes.set_xlabel("step ahead")
+    axes.set_ylabel("error (standard deviations)")
+    axes.set_ylim(bottom=0)
     axes.legend(frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     return figure

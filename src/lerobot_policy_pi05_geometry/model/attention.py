@@ -1,8 +1,8 @@
 """Attention in one function, for every query of the network.
 
 Two ways to compute the same thing. `scaled_dot_product_attention` is the default. It falls back to its slow path when
-the mask needs a gradient, which the suffix's does while the gate is trained; there, and in training on a CPU, two matrix
-products and a softmax are written out. benchmarks/attention.py measures both (docs/results.md).
+the mask needs a gradient, which the suffix's does while the gate is trained; there, two matrix products and a softmax are
+written out. benchmarks/attention.py measures both (docs/results.md).
 
 Shapes: B batch, H query heads, KV key/value heads, Q queries, K keys, D head_dim.
 """
@@ -34,12 +34,11 @@ class Attention(nn.Module):
 
     def forward(self, q: Tensor, k: Tensor, v: Tensor, mask: Tensor, bias: Tensor | None = None) -> Tensor:
         """q (B, H, Q, D), k and v (B, KV, K, D), mask (B, 1 or Q, K) bool, bias (H, K) float32 or None -> (B, H, Q, D)."""
-        needs_grad = torch.is_grad_enabled() and q.requires_grad
         # The gate needs a gradient, or more than bf16's three digits.
         gate_in_float32 = bias is not None and (
             q.dtype != torch.float32 or (torch.is_grad_enabled() and bias.requires_grad)
         )
-        if gate_in_float32 or (needs_grad and q.device.type == "cpu"):
+        if gate_in_float32:
             weights = attention_weights(q, k, mask, bias)  # (B, H, Q, K)
             return torch.matmul(_fold(weights, v), v).view_as(q)
         # Keys are expanded as views: with `enable_gqa` and a mask, CUDA has no fast kernel.

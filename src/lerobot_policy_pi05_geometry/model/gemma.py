@@ -8,6 +8,8 @@ Parameter names are those of LeRobot's π0.5. Shapes: B batch, N tokens of the s
 heads, D head_dim, K keys up to the segment's end.
 """
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -181,6 +183,19 @@ class GemmaModel(nn.Module):
         """Token ids (B, L) -> embeddings (B, L, W) times sqrt(W), as Gemma does."""
         embeddings = self.embed_tokens(tokens)
         return embeddings * torch.tensor(self.variant.width**0.5, dtype=embeddings.dtype)
+
+    @torch.no_grad()
+    def start_numbers_in_order(self, ids: Sequence[int]) -> None:
+        """Let the embeddings of the tokens 0, 1, 2, ... start as sines and cosines of the number, at the usual scale.
+
+        A pretrained VLM knows that 12 lies between 11 and 13. One from scratch has to learn it for every number apart,
+        and the state is written in numbers.
+        """
+        numbers, width = len(ids), self.variant.width
+        periods = 2 * numbers / 2 ** torch.linspace(0, 6, width // 2)  # from twice the range down to its 32nd part
+        angles = 2 * math.pi * torch.arange(numbers)[:, None] / periods
+        waves = torch.cat([angles.sin(), angles.cos()], dim=1) * (2 / width) ** 0.5  # each row has length 1
+        self.embed_tokens.weight[torch.tensor(ids)] = waves.to(self.embed_tokens.weight)
 
     def freeze_unread_output(self) -> None:
         """Freeze what feeds nothing when only keys and values of the last layer are read.

@@ -120,10 +120,12 @@ class PI05Pytorch(nn.Module):
         entries, one block by default. The rest as in `embed_prefix`.
         """
         samples = noise.shape[1] if noise.ndim == 4 else 1
-        if samples > 1 and self._geometry_follows_time:
-            raise ValueError(
-                "Several flow samples share one geometry segment, so geometry_time='denoise' has no one time."
-            )
+        if (
+            noise.ndim == 4 and self._geometry_follows_time
+        ):  # every flow time has a geometry of its own: nothing to share
+            observation, geometry_given = (images, img_masks, tokens, masks), (geom_embs, geom_pad, geom_att)
+            flow = zip(noise.unbind(1), time.unbind(1), strict=True)
+            return torch.stack([self.forward(*observation, actions, n, t, *geometry_given) for n, t in flow], dim=1)
         t = time[..., None, None]
         clean = actions if noise.ndim == 3 else actions[:, None]
         with compute_in(self.config.dtype, tokens.device):

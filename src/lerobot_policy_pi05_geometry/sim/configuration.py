@@ -16,12 +16,14 @@ from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
 class MetaworldRgbdEnv(EnvConfig):
     """A Meta-World task seen by an RGB-D camera (see environment.py).
 
-    task: of sim/tasks.py. cameras: range of camera poses, of sim/cameras.py. image_size: pixels per side.
+    task: of sim/tasks.py. cameras: range of camera poses, of sim/cameras.py. sensor: what the depth camera does to its
+    measurements, of sim/sensor.py. image_size: pixels per side.
     """
 
     task: str | None = "button-press-topdown-wide"
     fps: int = 20
     cameras: str = "train"
+    sensor: str = "ideal"
     image_size: int = 84
     episode_length: int | None = None
     features: dict[str, PolicyFeature] = field(default_factory=dict)
@@ -49,6 +51,7 @@ class MetaworldRgbdEnv(EnvConfig):
         return {
             "task": self.task,
             "cameras": self.cameras,
+            "sensor": self.sensor,
             "image_size": self.image_size,
             "episode_length": self.episode_length,
         }

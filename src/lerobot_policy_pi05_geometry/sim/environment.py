@@ -7,6 +7,7 @@ import numpy as np
 
 from .cameras import CAMERA_RANGES, extrinsics, intrinsics
 from .headless import mujoco
+from .sensor import SENSORS
 from .tasks import find_task, make_simulator
 
 CAMERA = "front"
@@ -37,13 +38,21 @@ class RgbdMetaworldEnv(gym.Env):
     render_mode = "rgb_array"
 
     def __init__(
-        self, task: str, cameras: str = "train", image_size: int = 84, episode_length: int | None = None
+        self,
+        task: str,
+        cameras: str = "train",
+        image_size: int = 84,
+        episode_length: int | None = None,
+        sensor: str = "ideal",
     ) -> None:
         if cameras not in CAMERA_RANGES:
             raise ValueError(f"There is no camera range '{cameras}'; choose one of: {', '.join(CAMERA_RANGES)}.")
+        if sensor not in SENSORS:
+            raise ValueError(f"There is no depth sensor '{sensor}'; choose one of: {', '.join(SENSORS)}.")
         spec = find_task(task)
         self.task, self.task_description = task, spec.instruction
         self._spec, self._range, self.image_size = spec, CAMERA_RANGES[cameras], image_size
+        self._sensor = SENSORS[sensor]
         self._max_episode_steps = episode_length or spec.max_steps
         size = image_size
         self.observation_space = gym.spaces.Dict(
@@ -71,6 +80,9 @@ class RgbdMetaworldEnv(gym.Env):
         # Meta-World ignores `reset(seed=)`; its own `seed` decides where the object stands.
         self._simulator.seed(int(self.np_random.integers(2**31)))
         self._camera = self._range.draw(self.np_random)
+        # Drawn last and apart, so that the same seed shows the same scene to every sensor.
+        self._sensor_random = np.random.default_rng(int(self.np_random.integers(2**31)))
+        self._pose_error = self._sensor.draw_pose_error(self._sensor_random)
         self.simulator_state, _ = self._simulator.reset()
         self._steps = 0
         return self._observe(), {"is_success": False}
@@ -91,13 +103,13 @@ class RgbdMetaworldEnv(gym.Env):
 
     def _observe(self) -> dict:
         self._pixels, depth = self._render()
-        millimetres = np.rint(depth * 1000.0)
+        millimetres = np.rint(self._sensor.measure(depth, self._sensor_random) * 1000.0)
         millimetres[millimetres > MAX_DEPTH_MM] = 0
         return {
             "pixels": {CAMERA: self._pixels},
             "agent_pos": self.simulator_state[:4].astype(np.float32),
             DEPTH_KEY: millimetres.astype(np.float32)[..., None],
-            EXTRINSICS_KEY: extrinsics(self._renderer.scene),
+            EXTRINSICS_KEY: (extrinsics(self._renderer.scene) @ self._pose_error).astype(np.float32),
         }
 
     def _render(self) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ from datasets.utils.logging import disable_progress_bar
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from ..geometry.calibration import CALIBRATION_FILE, write_calibration_file
+from ..quantiles import write_frame_quantiles
 from .environment import ACTION_NAMES, CAMERA, DEPTH_KEY, EXTRINSICS_KEY, FPS, STATE_NAMES, RgbdMetaworldEnv
 from .tasks import make_expert
 
@@ -81,6 +82,7 @@ def record(
                 )
             yield done, frames is not None
         dataset.finalize()
+        write_frame_quantiles(unfinished, repo_id)
         write_calibration_file(unfinished / "meta" / CALIBRATION_FILE, environment.calibration)
         unfinished.rename(root)
     finally:

@@ -19,7 +19,7 @@ class TaskSpec:
     environment: str
     instruction: str
     object_range: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    max_steps: int = 30
+    max_steps: int = 40
 
 
 WIDE_TASKS = {
@@ -32,6 +32,11 @@ WIDE_TASKS = {
         "faucet-open-v3",
         "turn the faucet open",
         ((-0.20, 0.65, 0.0), (0.20, 0.90, 0.0)),
+    ),
+    "coffee-button-wide": TaskSpec(
+        "coffee-button-v3",
+        "press the button of the coffee machine",
+        ((-0.20, 0.75, -0.001), (0.20, 0.95, 0.001)),
     ),
 }
 

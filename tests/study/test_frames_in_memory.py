@@ -4,8 +4,8 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_policy_pi05_geometry.demo.frames_in_memory import FramesInMemory
 from lerobot_policy_pi05_geometry.sim.record import record
+from lerobot_policy_pi05_geometry.study.frames_in_memory import FramesInMemory
 
 pytestmark = pytest.mark.sim
 

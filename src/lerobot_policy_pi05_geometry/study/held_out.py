@@ -1,0 +1,244 @@
+"""A run on a user's own data: trained on some episodes, its action chunks compared with those of the others.
+
+No simulator and no robot: this is open-loop error, not success. A policy may act well along another path than the one that
+was recorded, or fail by small errors that add up. It says whether geometry helps to predict what was done.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.factory import make_train_eval_datasets
+from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from torch.utils.data import default_collate
+
+from ..geometry.keys import DEPTH_SUFFIX, depth_key
+from ..loading import LoadedPolicy, load_policy
+from .arms import find_arm
+from .runs import Run, Say, option_list
+from .training import train_with
+
+ALL_CAMERAS, NO_DEPTH, ONLY = "all-cameras", "no-depth", "only-"
+_NOISE_SEED = 0  # every frame's chunk starts from noise of its own, the same for every arm
+
+
+@dataclass(frozen=True)
+class HeldOutRun(Run):
+    """An arm on a user's dataset.
+
+    dataset_root, repo_id: the dataset. options: the user's own of lerobot-train. held_out: share of each task's episodes
+    that are evaluated and not trained on, the last ones. frames: of each held-out episode that are evaluated, evenly spaced.
+    """
+
+    dataset_root: Path
+    repo_id: str
+    options: tuple[tuple[str, str], ...]
+    training_steps: int
+    held_out: float
+    frames: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.dataset_root.name}-{self.arm_name}-{self.seed}"
+
+    @property
+    def steps(self) -> int:
+        return self.training_steps
+
+    @property
+    def evaluation_size(self) -> int:
+        episodes = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).total_episodes
+        return self.frames * math.ceil(self.held_out * episodes)
+
+    def description(self) -> dict[str, Any]:
+        meta = self.dataset_root / "meta"
+        return {
+            "arm": self.arm_name,
+            "arguments": self.arguments(Path("output")),
+            "dataset": [(meta / name).read_text() for name in ("info.json", "stats.json")],
+            "versions": {name: version(name) for name in ("lerobot_policy_pi05_geometry", "lerobot", "torch")},
+        }
+
+    def evaluation_description(self, condition: str) -> dict[str, Any]:
+        return {"condition": condition, "frames": self.frames}
+
+    def own_conditions(self) -> list[str]:
+        return list(self.conditions) if self.arm.depth else [ALL_CAMERAS]
+
+    def prepare(self, say: Say) -> None:
+        """The data is the user's, and there."""
+
+    def train(self, output: Path) -> None:
+        videos = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).video_keys
+        train_with(self.arguments(output), in_memory=not videos)
+
+    def arguments(self, output: Path) -> list[str]:
+        """lerobot-train's arguments; the user's options hold over all but what the study decides."""
+        return option_list(
+            {
+                "policy.type": "pi05_geometry",
+                "policy.push_to_hub": "false",
+                "num_workers": 0,
+                **dict(self.options),
+                **self.arm.options,
+                **self._blind_inputs(),
+                "dataset.repo_id": self.repo_id,
+                "dataset.root": self.dataset_root,
+                "dataset.eval_split": self.held_out,
+                "steps": self.training_steps,
+                "save_freq": self.training_steps,
+                "log_freq": max(1, self.training_steps // 60),
+                "seed": self.seed,
+                "output_dir": output,
+            }
+        )
+
+    def _blind_inputs(self) -> dict[str, str]:
+        """The blind arm's inputs, with the size that this dataset's state has."""
+        if self.arm.options.get("policy.input_features") is None:
+            return {}
+        features = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).features
+        if OBS_STATE not in features:
+            raise ValueError(
+                f"{self.dataset_root} has no {OBS_STATE}, so a blind policy would see nothing; leave that arm out."
+            )
+        shape = list(features[OBS_STATE]["shape"])
+        return {"policy.input_features": json.dumps({OBS_STATE: {"type": "STATE", "shape": shape}})}
+
+    def evaluate(self, condition: str, say: Say) -> None:
+        config = TrainPipelineConfig.from_pretrained(self.checkpoint)
+        _, dataset = make_train_eval_datasets(config)
+        assert dataset is not None  # held_out is above 0
+        loaded = load_policy(self.checkpoint, str(config.trainable_config.device))
+        errors = action_errors(loaded, dataset, condition, self.frames, lambda done, n: say(condition, done, n))
+        unfinished = self.folder / "unfinished.npz"
+        np.savez_compressed(unfinished, errors=errors)
+        unfinished.replace(self.outcome(condition))
+
+    def errors(self, condition: str) -> np.ndarray | None:
+        """Mean error per held-out episode, horizon step and action dimension, (E, S, D); None while it is missing."""
+        path = self.outcome(condition if self.arm.depth else ALL_CAMERAS)
+        if not path.exists():
+            return None
+        with np.load(path, allow_pickle=False) as file:
+            return file["errors"]
+
+
+def from_json(content: dict[str, Any]) -> HeldOutRun:
+    """The run that `to_json` wrote."""
+    return HeldOutRun(
+        Path(content["root"]),
+        content["arm_name"],
+        content["seed"],
+        tuple(content["conditions"]),
+        Path(content["dataset_root"]),
+        content["repo_id"],
+        tuple((name, value) for name, value in content["options"]),
+        content["training_steps"],
+        content["held_out"],
+        content["frames"],
+    )
+
+
+def held_out_runs(
+    output: Path,
+    dataset_root: Path,
+    repo_id: str,
+    arms: Sequence[str],
+    seeds: Sequence[int],
+    options: Mapping[str, str],
+    steps: int,
+    held_out: float,
+    frames: int,
+) -> list[HeldOutRun]:
+    """Every run of a study on a user's dataset, seed by seed.
+
+    Raises FileNotFoundError or ValueError with one sentence for what cannot be studied.
+    """
+    if not (dataset_root / "meta" / "info.json").is_file():
+        raise FileNotFoundError(f"{dataset_root} holds no LeRobotDataset (meta/info.json is missing).")
+    if not 0 < held_out < 1:
+        raise ValueError(f"The share of held-out episodes must be between 0 and 1, got {held_out}.")
+    for name in arms:
+        if find_arm(name).cameras != "train":
+            raise ValueError(f"Arm '{name}' needs other camera poses in its data, which only the simulator has.")
+    views = view_conditions(dataset_root, repo_id)
+    if len(views) == 1 and any(find_arm(name).depth for name in arms):
+        raise ValueError(
+            f"{dataset_root} has no depth (observation.images.<camera>{DEPTH_SUFFIX}), which arm 'geometry' and its variants "
+            "read; record depth, or choose other --arms."
+        )
+    return [
+        HeldOutRun(
+            output.absolute(), arm, seed, tuple(views), dataset_root.absolute(), repo_id, tuple(options.items()), steps,
+            held_out, frames,
+        )
+        for seed in seeds
+        for arm in arms
+    ]  # fmt: skip
+
+
+def view_conditions(root: Path, repo_id: str) -> list[str]:
+    """What an arm with depth is shown at evaluation: all depth cameras, each one alone, and none."""
+    prefix = f"{OBS_IMAGES}."
+    keys = LeRobotDatasetMetadata(repo_id, root=root).features
+    cameras = sorted(
+        key.removeprefix(prefix).removesuffix(DEPTH_SUFFIX)
+        for key in keys
+        if key.startswith(prefix) and key.endswith(DEPTH_SUFFIX)
+    )
+    alone = [f"{ONLY}{camera}" for camera in cameras] if len(cameras) > 1 else []
+    return [ALL_CAMERAS, *alone, NO_DEPTH] if cameras else [ALL_CAMERAS]
+
+
+def hide_depth(batch: dict[str, Any], condition: str) -> dict[str, Any]:
+    """The batch with the depth of other cameras than the condition's measuring nothing."""
+    if condition == ALL_CAMERAS:
+        return batch
+    shown = depth_key(condition.removeprefix(ONLY)) if condition.startswith(ONLY) else None
+    return {
+        key: torch.zeros_like(value) if key.endswith(DEPTH_SUFFIX) and key != shown else value
+        for key, value in batch.items()
+    }
+
+
+@torch.no_grad()
+def action_errors(
+    loaded: LoadedPolicy,
+    dataset: LeRobotDataset,
+    condition: str,
+    frames: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> np.ndarray:
+    """Mean absolute error of predicted actions, in the dataset's units, (E, S, D); NaN where no frame reaches so far.
+
+    One chunk is predicted at each of `frames` evenly spaced frames of every episode of the dataset.
+    """
+    episode_of = np.asarray(dataset.hf_dataset["episode_index"])
+    episodes = np.unique(episode_of)
+    policy, means = loaded.policy, []
+    for number, episode in enumerate(episodes):
+        rows = np.flatnonzero(episode_of == episode)
+        chosen = rows[np.unique(np.linspace(0, len(rows) - 1, frames).astype(int))]
+        batch = default_collate([dataset[int(row)] for row in chosen])
+        actions, is_pad = batch[ACTION], batch["action_is_pad"]  # (N, S, D), (N, S)
+        observation = {k: v for k, v in batch.items() if not k.startswith(ACTION)}
+        shape = (len(chosen), policy.config.chunk_size, policy.config.max_action_dim)
+        noise = torch.randn(shape, generator=torch.Generator().manual_seed(_NOISE_SEED + int(episode)))
+        policy.reset()
+        chunk = policy.predict_action_chunk(
+            loaded.preprocess(hide_depth(observation, condition)), noise=noise.to(policy.config.device)
+        )
+        predicted = torch.stack([loaded.postprocess(step) for step in chunk.unbind(1)], dim=1)  # (N, S, D)
+        error = (predicted.cpu() - actions).abs().masked_fill(is_pad[..., None], float("nan"))
+        means.append(error.nanmean(dim=0).numpy())
+        progress(number + 1, len(episodes))
+    return np.stack(means)

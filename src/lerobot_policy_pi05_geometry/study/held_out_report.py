@@ -1,0 +1,153 @@
+"""The page of a study on a user's own data: action error on held-out episodes, per arm, per camera, per step ahead."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION
+
+from ..inspect.page import Page, picture
+from ..inspect.pictures import curves_figure, horizon_figure
+from .arms import ARMS
+from .held_out import ALL_CAMERAS, NO_DEPTH, ONLY, HeldOutRun
+from .statistics import bootstrap
+from .training_log import read_curve
+
+Errors = dict[tuple[str, str], np.ndarray]  # by arm and condition, (training seeds, episodes, S)
+
+
+def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str) -> Path:
+    """Write report.html, errors.csv, errors.parquet and the pictures; returns the path of the page.
+
+    Errors are in standard deviations of the recorded actions, averaged over action dimensions. A run that crashed has no
+    error to count, so it is named, and its arm is shown without that seed.
+    """
+    errors = collect(runs)
+    table = errors_table(runs)
+    table.to_csv(folder / "errors.csv", index=False)
+    table.to_parquet(folder / "errors.parquet", index=False)
+    pictures = folder / "pictures"
+    pictures.mkdir(exist_ok=True)
+    page = Page(f"Does geometry help on {runs[0].dataset_root.name}?")
+    page.lead(answer(errors))
+    seeds, first = len({run.seed for run in runs}), runs[0]
+    page.text(
+        f"{len(runs)} training runs of {first.steps} steps, {seeds} training seed{'s' if seeds > 1 else ''}; the last "
+        f"{first.held_out:.0%} of the episodes were held out. Errors are mean absolute errors of predicted action chunks, in "
+        "standard deviations of the recorded actions (1 is a guess of the mean's size), with 95 % intervals from a "
+        "bootstrap over training seeds and held-out episodes."
+    )
+    crashed = [run.name for run in runs if run.crash.exists()]
+    if crashed:
+        page.text(f"Crashed, and missing from the figures: {', '.join(crashed)}.")
+    page.text(
+        "This is open-loop error, not success: a policy may act well along another path than the recorded one, and small "
+        "errors may add up to failure. Only runs on the robot or in a simulator tell."
+    )
+    conditions = [c for c in runs[0].conditions if any(key[1] == c for key in errors)]
+    arms = [arm for arm in ARMS if (arm, ALL_CAMERAS) in errors]
+    page.table(
+        ["arm", "what it is", *(_title(c) for c in conditions)],
+        [[arm, ARMS[arm].title, *(_interval(errors[arm, c].mean(axis=2)) for c in conditions)] for arm in arms],
+    )
+    if "geometry" in arms and len(arms) > 1:
+        page.text("geometry minus each arm on the same episodes; below zero, geometry predicts better.")
+        rows = [[arm, *(_gap(errors, arm, c) for c in conditions)] for arm in arms if arm != "geometry"]
+        page.table(["geometry minus", *(_title(c) for c in conditions)], rows)
+    bands = {arm: _bands(errors[arm, ALL_CAMERAS]) for arm in arms}
+    caption = "Error of the action so many steps ahead, mean and interval."
+    page.row(picture(horizon_figure(bands), caption, pictures / "horizon.png"))
+    curves = {run.arm_name: read_curve(run.log) for run in runs if run.seed == runs[0].seed and run.checkpoint.exists()}
+    page.row(picture(curves_figure(curves), "Loss on training batches, first seed.", pictures / "curves.png"))
+    page.heading("Again")
+    page.code(command)
+    path = folder / "report.html"
+    page.write(path)
+    return path
+
+
+def collect(runs: Sequence[HeldOutRun]) -> Errors:
+    """Errors per arm and condition, (training seeds, episodes, S). Raises ValueError for a run that is not complete."""
+    found: dict[tuple[str, str], list[np.ndarray]] = {}
+    for run in runs:
+        if run.crash.exists():
+            continue
+        scale = np.maximum(_action_spread(run), 1e-9)
+        for condition in run.conditions:
+            errors = run.errors(condition)
+            if errors is None:
+                raise ValueError(
+                    f"Run {run.name} has not been evaluated under '{condition}' yet; let the study finish."
+                )
+            found.setdefault((run.arm_name, condition), []).append(np.nanmean(errors / scale, axis=2))
+    if not found:
+        raise ValueError("Every run of the study crashed; see the run.log of each.")
+    return {key: _whole_steps(np.stack(values)) for key, values in found.items()}
+
+
+def errors_table(runs: Sequence[HeldOutRun]) -> pd.DataFrame:
+    """One row per run, condition, held-out episode, step ahead and action dimension, in the dataset's units."""
+    frames = []
+    for run in runs:
+        for condition in run.own_conditions():
+            errors = None if run.crash.exists() else run.errors(condition)
+            if errors is not None:
+                index = pd.MultiIndex.from_product(map(range, errors.shape), names=["episode", "step", "dimension"])
+                of_run = pd.DataFrame({"error": errors.reshape(-1)}, index=index).reset_index()
+                frames.append(of_run.assign(arm=run.arm_name, training_seed=run.seed, condition=condition))
+    return pd.concat(frames, ignore_index=True)
+
+
+def answer(errors: Errors) -> str:
+    """What came out, in one sentence, whatever it is."""
+    if ("geometry", ALL_CAMERAS) not in errors or ("rgb", ALL_CAMERAS) not in errors:
+        arm, _ = min(errors, key=lambda key: errors[key].mean())
+        return f"The arm with the smallest error on held-out episodes is {arm}."
+    geometry, rgb = errors["geometry", ALL_CAMERAS], errors["rgb", ALL_CAMERAS]
+    means = f"{geometry.mean():.3f} with geometry, {rgb.mean():.3f} with RGB only"
+    if geometry.shape != rgb.shape:
+        return (
+            f"On held-out episodes the action error is {means}; runs crashed, so the two cannot be compared in pairs."
+        )
+    gap, low, high = bootstrap((geometry - rgb).mean(axis=2))
+    if low <= 0 <= high:
+        verdict = "no difference that these episodes can show"
+    else:
+        verdict = "geometry predicts better" if gap < 0 else "geometry predicts worse"
+    return f"On held-out episodes the action error is {means}: {verdict} ({gap:+.3f}, {low:+.3f} to {high:+.3f})."
+
+
+def _action_spread(run: HeldOutRun) -> np.ndarray:
+    stats = LeRobotDatasetMetadata(run.repo_id, root=run.dataset_root).stats
+    return np.asarray(stats[ACTION]["std"], dtype=np.float64).reshape(-1)
+
+
+def _whole_steps(errors: np.ndarray) -> np.ndarray:
+    """Without the steps that lie beyond the end of some episode's frames."""
+    return errors[..., ~np.isnan(errors).any(axis=(0, 1))]
+
+
+def _bands(errors: np.ndarray) -> np.ndarray:
+    """Mean, low and high per step ahead, (3, S)."""
+    return np.array([bootstrap(errors[..., step]) for step in range(errors.shape[2])]).T
+
+
+def _interval(values: np.ndarray) -> str:
+    mean, low, high = bootstrap(values)
+    return f"{mean:.3f} ({low:.3f} to {high:.3f})"
+
+
+def _gap(errors: Errors, arm: str, condition: str) -> str:
+    geometry, other = errors["geometry", condition], errors[arm, condition]
+    if geometry.shape != other.shape:
+        return "not in pairs"
+    mean, low, high = bootstrap((geometry - other).mean(axis=2))
+    return f"{mean:+.3f} ({low:+.3f} to {high:+.3f})"
+
+
+def _title(condition: str) -> str:
+    if condition == NO_DEPTH:
+        return "no depth"
+    return "all cameras" if condition == ALL_CAMERAS else f"depth of {condition.removeprefix(ONLY)} alone"

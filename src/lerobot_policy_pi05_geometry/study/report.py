@@ -1,0 +1,194 @@
+"""The study's page: the answer first, then the figures that show it, then what they cannot say."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from safetensors import safe_open
+
+from ..inspect.inspection import frame_batch
+from ..inspect.page import Page, picture, video
+from ..inspect.pictures import curves_figure, depth_figure, layout_figure, segment_share_figure, success_figure
+from ..loading import load_policy
+from .arms import ARMS
+from .conditions import CONDITIONS
+from .results import Cell, Versus, cells, comparisons, episodes_table
+from .simulated import SimulatedRun
+from .training_log import read_curve
+
+_SHOWN_IN_VIDEOS = ("geometry", "rgb", "random")
+
+
+def write_report(folder: Path, runs: Sequence[SimulatedRun], command: str) -> Path:
+    """Write report.html, episodes.csv, episodes.parquet and the pictures; returns the path of the page.
+
+    command: how the study was started, for the reader who wants to repeat it.
+    """
+    table = episodes_table(runs)
+    table.to_csv(folder / "episodes.csv", index=False)
+    table.to_parquet(folder / "episodes.parquet", index=False)
+    pictures = folder / "pictures"
+    pictures.mkdir(exist_ok=True)
+    found, versus = cells(table), comparisons(table)
+    page = Page("Does geometry help?")
+    page.lead(answer(table))
+    _what_was_done(page, runs)
+    for task in dict.fromkeys(run.task for run in runs):
+        _task(page, task, [c for c in found if c.task == task], [v for v in versus if v.task == task], runs, pictures)
+    _inside(page, runs, pictures)
+    page.heading("What this cannot say")
+    page.text(
+        "The networks are small and trained from scratch, depth is simulated, the experts are scripted and the tasks are "
+        "few: how much a pretrained π0.5 gains on a real robot is not measured here. Wilson intervals treat all episodes of "
+        "an arm alike; the intervals of differences resample training seeds too, of which there are "
+        f"{len({run.seed for run in runs})}. A difference whose corrected p is above 0.05 is no difference that this study "
+        "can show."
+    )
+    page.heading("Again, or on your own")
+    page.code(command)
+    path = folder / "report.html"
+    page.write(path)
+    return path
+
+
+def answer(table: pd.DataFrame) -> str:
+    """What came out, in one sentence, whatever it is: geometry against RGB only with the camera moved."""
+    rows = table[table["condition"] == "outside"]
+    arms = {cell.arm: cell for cell in cells(rows.assign(task="all"))}
+    if "geometry" not in arms or "rgb" not in arms:
+        best = max(cells(table), key=lambda cell: cell.rate)
+        return f"The best cell of this study is {best.arm} under '{best.condition}': {_cell(best)}."
+    geometry, rgb = arms["geometry"], arms["rgb"]
+    apart = geometry.interval()[0] > rgb.interval()[1] or rgb.interval()[0] > geometry.interval()[1]
+    verdict = "the intervals do not overlap" if apart else "the intervals overlap, so this does not tell them apart"
+    text = (
+        "With the camera outside the range it was trained on, the policy with geometry succeeds in "
+        f"{_cell(geometry)} of episodes and RGB only in {_cell(rgb)}: {verdict}."
+    )
+    controls = [f"{_NAMES[arm]} {arms[arm].rate:.0%}" for arm in _NAMES if arm in arms]
+    return text + (f" For comparison: {', '.join(controls)}." if controls else "")
+
+
+_NAMES = {"rgb-wide": "RGB trained on the wide camera range", "random": "random tokens", "blind": "no camera at all"}
+
+
+def _what_was_done(page: Page, runs: Sequence[SimulatedRun]) -> None:
+    budget = runs[0].budget
+    seeds = len({run.seed for run in runs})
+    page.text(
+        f"{len(runs)} training runs: {budget.episodes} expert episodes, {budget.steps} steps of {budget.batch_size} samples "
+        f"with {budget.flow_samples} flow samples each, {seeds} training seed{'s' if seeds > 1 else ''}; the same data, budget "
+        f"and sizes for every arm. Every cell is {budget.evaluation_episodes} unseen seeds per training seed, the same for "
+        f"every arm, with a new prediction every {budget.action_steps} steps. The raw table is episodes.csv."
+    )
+    crashed = [run for run in runs if run.crash.exists()]
+    if crashed:
+        page.text(
+            "Crashed, and counted as failures: "
+            + "; ".join(f"{run.name} (its log: {run.log.name} in {run.folder.name})" for run in crashed)
+        )
+
+
+def _task(
+    page: Page, task: str, found: list[Cell], versus: list[Versus], runs: Sequence[SimulatedRun], pictures: Path
+) -> None:
+    page.heading(task)
+    conditions = [name for name in CONDITIONS if any(cell.condition == name for cell in found)]
+    arms = [name for name in ARMS if any(cell.arm == name for cell in found)]
+    by_place = {(cell.arm, cell.condition): cell for cell in found}
+    bars = {arm: [_bar(by_place[arm, condition]) for condition in conditions] for arm in arms}
+    titles = [CONDITIONS[condition].title for condition in conditions]
+    caption = "Success per arm and condition, over all training seeds."
+    page.row(picture(success_figure(titles, bars), caption, pictures / f"success_{task}.png"))
+    parameters = {run.arm_name: _parameters(run) for run in runs if run.task == task and run.checkpoint.exists()}
+    page.table(
+        ["arm", "what it is", "parameters", *titles],
+        [
+            [arm, ARMS[arm].title, parameters.get(arm, "crashed"), *(_cell(by_place[arm, c]) for c in conditions)]
+            for arm in arms
+        ],
+    )
+    if versus:
+        page.text(
+            "geometry against each arm on the same seeds: difference of the success rates in points (95 % bootstrap interval "
+            "over training seeds and episodes), and the exact McNemar p, corrected for all comparisons of the study (Holm)."
+        )
+        by_pair = {(v.arm, v.condition): v for v in versus}
+        page.table(
+            ["geometry minus", *titles],
+            [[arm, *(_difference(by_pair[arm, c]) for c in conditions)] for arm in arms if arm != "geometry"],
+        )
+    for condition in [c for c in ("inside", "outside") if c in conditions]:
+        shown = [arm for arm in _SHOWN_IN_VIDEOS if arm in arms]
+        clips = _side_by_side([run for run in runs if run.task == task], shown, condition)
+        if clips is not None:
+            title = f"From left: {', '.join(shown)}. {CONDITIONS[condition].title.capitalize()}."
+            page.row(video(clips, 10, title, pictures / f"rollout_{task}_{condition}.mp4"))
+
+
+def _inside(page: Page, runs: Sequence[SimulatedRun], pictures: Path) -> None:
+    """What a trained policy with geometry looks at, and how training went."""
+    trained = [run for run in runs if run.checkpoint.exists()]
+    first = next((run for run in trained if run.arm_name == "geometry"), None)
+    page.heading("Inside")
+    if first is not None:
+        loaded = load_policy(first.checkpoint)
+        batch = loaded.preprocess(frame_batch(LeRobotDataset(f"local/{first.task}", root=first.data_folder), 0))
+        where = (
+            "The first frame of the dataset. Right: attention of the action tokens on geometry at the last denoising "
+            "step, mean over layers, heads and tokens."
+        )
+        page.row(picture(depth_figure(loaded.policy, batch), where, pictures / "depth.png"))
+        page.row(
+            picture(
+                layout_figure(loaded.policy, batch),
+                "Rows look at columns. The prefix never sees geometry; the actions see everything.",
+                pictures / "layout.png",
+            ),
+            picture(
+                segment_share_figure(loaded.policy, batch),
+                "What the action tokens attend to, layer by layer.",
+                pictures / "shares.png",
+            ),
+        )
+    same = [run for run in trained if (run.task, run.seed) == (trained[0].task, trained[0].seed)] if trained else []
+    if same:
+        curves = {run.arm_name: read_curve(run.log) for run in same}
+        page.row(picture(curves_figure(curves), "Loss on training batches, first seed.", pictures / "curves.png"))
+
+
+def _bar(cell: Cell) -> tuple[float, float, float]:
+    return (cell.rate, *cell.interval())
+
+
+def _cell(cell: Cell) -> str:
+    low, high = cell.interval()
+    crashed = f", {cell.crashed_runs} crashed" if cell.crashed_runs else ""
+    return f"{cell.rate:.0%} ({low:.0%} to {high:.0%}{crashed})"
+
+
+def _difference(versus: Versus) -> str:
+    result = versus.result
+    p = "p < 0.001" if versus.p < 0.001 else f"p = {versus.p:.2g}"
+    return f"{100 * result.difference:+.0f} ({100 * result.low:+.0f} to {100 * result.high:+.0f}), {p}"
+
+
+def _parameters(run: SimulatedRun) -> str:
+    with safe_open(run.checkpoint / "model.safetensors", framework="pt") as file:
+        return f"{sum(np.prod(file.get_slice(key).get_shape()) for key in file.keys()):,.0f}"  # noqa: SIM118
+
+
+def _side_by_side(runs: Sequence[SimulatedRun], arms: Sequence[str], condition: str) -> np.ndarray | None:
+    """The first episodes of these arms on the same seeds, one after the other, (T, H, arms * W, 3)."""
+    of_arm = {run.arm_name: run.evaluation(condition) for run in reversed(runs) if not run.crash.exists()}
+    evaluations = [of_arm[arm] for arm in arms if of_arm.get(arm) is not None]
+    if len(evaluations) != len(arms) or not arms:
+        return None
+    clips = []
+    for episode in zip(*(evaluation.videos for evaluation in evaluations), strict=True):
+        length = max(len(clip) for clip in episode) + 5  # a short rest between episodes
+        padded = [np.concatenate([clip, clip[-1:].repeat(length - len(clip), axis=0)]) for clip in episode]
+        clips.append(np.concatenate(padded, axis=2))
+    return np.concatenate(clips) if clips else None

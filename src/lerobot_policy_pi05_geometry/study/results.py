@@ -1,0 +1,108 @@
+"""What came out of a study: a table with one row per episode, and what follows from it.
+
+A run that crashed has its episodes in the table too, as failures marked `crashed`: leaving them out would make an arm that
+often crashes look better.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from .arms import ARMS
+from .conditions import CONDITIONS
+from .simulated import SimulatedRun
+from .statistics import Difference, compare, holm, wilson
+
+
+def episodes_table(runs: Sequence[SimulatedRun]) -> pd.DataFrame:
+    """One row per episode: task, arm, training_seed, condition, episode_seed, success, steps, crashed.
+
+    Raises ValueError if a run is neither complete nor crashed.
+    """
+    rows = []
+    for run in runs:
+        for condition in dict.fromkeys(run.conditions):
+            evaluation = run.evaluation(condition)
+            crashed = evaluation is None and run.crash.exists()
+            if evaluation is None and not crashed:
+                raise ValueError(
+                    f"Run {run.name} has not been evaluated under '{condition}' yet; let the study finish."
+                )
+            if evaluation is None:
+                seeds = list(range(run.budget.evaluation_episodes))
+                outcomes = [(seed, False, 0) for seed in seeds]
+            else:
+                outcomes = list(zip(evaluation.seeds, evaluation.successes, evaluation.steps, strict=True))
+            rows += [
+                (run.task, run.arm_name, run.seed, condition, seed, success, steps, crashed)
+                for seed, success, steps in outcomes
+            ]
+    columns = ["task", "arm", "training_seed", "condition", "episode_seed", "success", "steps", "crashed"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Success of an arm on a task under a condition, over all training seeds."""
+
+    task: str
+    arm: str
+    condition: str
+    successes: int
+    episodes: int
+    crashed_runs: int
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.episodes
+
+    def interval(self) -> tuple[float, float]:
+        """95 % Wilson interval."""
+        return wilson(self.successes, self.episodes)
+
+
+def cells(table: pd.DataFrame) -> list[Cell]:
+    """Every cell of a study, tasks, arms and conditions in their own order."""
+    found = []
+    for (task, arm, condition), rows in table.groupby(["task", "arm", "condition"], sort=False):
+        crashed = rows.loc[rows["crashed"], "training_seed"].nunique()
+        found.append(Cell(task, arm, condition, int(rows["success"].sum()), len(rows), crashed))
+    order = {name: i for i, name in enumerate([*ARMS, *CONDITIONS])}
+    return sorted(found, key=lambda cell: (cell.task, order[cell.arm], order[cell.condition]))
+
+
+@dataclass(frozen=True)
+class Versus:
+    """One arm against the reference arm; `p` is corrected over all comparisons of the study."""
+
+    task: str
+    condition: str
+    arm: str
+    reference: str
+    result: Difference
+    p: float
+
+
+def comparisons(table: pd.DataFrame, reference: str = "geometry") -> list[Versus]:
+    """Every arm against the reference arm, on the same seeds, per task and condition."""
+    found: list[tuple[str, str, str, Difference]] = []
+    for (task, condition), rows in table.groupby(["task", "condition"], sort=False):
+        grids = {arm: _grid(of_arm) for arm, of_arm in rows.groupby("arm", sort=False)}
+        if reference in grids:
+            found += [
+                (task, condition, arm, compare(grids[reference], grid))
+                for arm, grid in grids.items()
+                if arm != reference
+            ]
+    corrected = holm([difference.p for *_, difference in found])
+    return [
+        Versus(task, condition, arm, reference, difference, p)
+        for (task, condition, arm, difference), p in zip(found, corrected, strict=True)
+    ]
+
+
+def _grid(rows: pd.DataFrame) -> np.ndarray:
+    """Success by (training seed, episode seed), bool."""
+    return rows.pivot(index="training_seed", columns="episode_seed", values="success").to_numpy(dtype=bool)

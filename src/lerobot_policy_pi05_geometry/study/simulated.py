@@ -1,0 +1,158 @@
+"""A run in the simulator: the same expert episodes for every arm, success on the same unseen seeds."""
+
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from ..loading import load_policy
+from ..sim.cameras import CAMERA_RANGES
+from ..sim.configuration import MetaworldRgbdEnv
+from ..sim.evaluate import Evaluation, evaluate
+from ..sim.record import record
+from ..sim.sensor import SENSORS
+from ..sim.tasks import find_task
+from .conditions import counts_as, find_condition
+from .locks import alone
+from .runs import Run, Say, option_list, short_hash
+from .spec import Budget, StudySpec
+from .training import train_with
+
+_EVALUATION = ("evaluation_episodes", "parallel", "videos")  # of the budget: what training does not depend on
+_PACKAGES = ("lerobot_policy_pi05_geometry", "lerobot", "torch", "mujoco", "metaworld")
+
+
+@dataclass(frozen=True)
+class SimulatedRun(Run):
+    """A task, an arm and a training seed. Its data is kept in <root>/data/<task>-<cameras>-<hash>/."""
+
+    task: str
+    budget: Budget
+
+    @property
+    def name(self) -> str:
+        return f"{self.task}-{self.arm_name}-{self.seed}"
+
+    @property
+    def steps(self) -> int:
+        return self.budget.steps
+
+    @property
+    def evaluation_size(self) -> int:
+        return self.budget.evaluation_episodes
+
+    def data_description(self) -> dict[str, Any]:
+        """What the expert episodes depend on."""
+        return {
+            "task": asdict(find_task(self.task)),
+            "cameras": asdict(CAMERA_RANGES[self.arm.cameras]),
+            "episodes": self.budget.episodes,
+            "image_size": self.budget.image_size,
+            "versions": {name: version(name) for name in _PACKAGES},
+        }
+
+    def description(self) -> dict[str, Any]:
+        spent = {name: value for name, value in asdict(self.budget).items() if name not in _EVALUATION}
+        arm = {"arm": self.arm_name, "options": self.arm.options, "seed": self.seed}
+        return {**arm, "budget": spent, "data": self.data_description()}
+
+    def evaluation_description(self, condition: str) -> dict[str, Any]:
+        about = find_condition(condition)
+        return {
+            "cameras": asdict(CAMERA_RANGES[about.cameras]),
+            "sensor": asdict(SENSORS[about.sensor]),
+            "budget": {name: getattr(self.budget, name) for name in _EVALUATION},
+        }
+
+    @property
+    def data_folder(self) -> Path:
+        return self.root / "data" / f"{self.task}-{self.arm.cameras}-{short_hash(self.data_description())}"
+
+    def own_conditions(self) -> list[str]:
+        return list(dict.fromkeys(counts_as(condition, self.arm.depth) for condition in self.conditions))
+
+    def evaluation(self, condition: str) -> Evaluation | None:
+        """The episodes that count for a condition; None while they are missing."""
+        path = self.outcome(counts_as(condition, self.arm.depth))
+        return Evaluation.load(path) if path.exists() else None
+
+    def prepare(self, say: Say) -> None:
+        budget, cameras = self.budget, self.arm.cameras
+        with alone(self.data_folder):
+            if self.data_folder.exists():
+                return
+            repo_id = f"local/{self.task}"
+            for done, _ in record(self.data_folder, repo_id, self.task, budget.episodes, cameras, budget.image_size):
+                say("record", done, budget.episodes)
+
+    def train(self, output: Path) -> None:
+        train_with(self.arguments(output))
+
+    def arguments(self, output: Path) -> list[str]:
+        """lerobot-train's arguments."""
+        budget = self.budget
+        options: dict[str, Any] = {
+            "policy.type": "pi05_geometry",
+            "policy.device": budget.device,
+            "policy.push_to_hub": "false",
+            "policy.paligemma_variant": budget.variant,
+            "policy.action_expert_variant": budget.variant,
+            "policy.image_resolution": f"[{budget.image_size}, {budget.image_size}]",
+            "policy.chunk_size": budget.chunk_size,
+            "policy.n_action_steps": budget.action_steps,
+            "policy.max_action_dim": 4,
+            "policy.num_inference_steps": 5,
+            "policy.flow_samples": budget.flow_samples,
+            "policy.optimizer_lr": budget.learning_rate,
+            "policy.scheduler_decay_lr": budget.learning_rate / 20,
+            "policy.scheduler_warmup_steps": min(50, budget.steps),
+            "policy.scheduler_decay_steps": budget.steps,
+            **self.arm.options,
+            "dataset.repo_id": f"local/{self.task}",
+            "dataset.root": self.data_folder,
+            "batch_size": budget.batch_size,
+            "steps": budget.steps,
+            "num_workers": 0,
+            "log_freq": max(1, budget.steps // 60),
+            "save_freq": budget.steps,
+            "seed": self.seed,
+            "output_dir": output,
+        }
+        return option_list(options)
+
+    def evaluate(self, condition: str, say: Say) -> None:
+        about, budget = find_condition(condition), self.budget
+        environment = MetaworldRgbdEnv(
+            task=self.task, cameras=about.cameras, sensor=about.sensor, image_size=budget.image_size
+        )
+        evaluate(
+            load_policy(self.checkpoint, budget.device, environment),
+            environment,
+            budget.evaluation_episodes,
+            parallel=budget.parallel,
+            videos=budget.videos,
+            progress=lambda done: say(f"evaluate {condition}", done, budget.evaluation_episodes),
+        ).save(self.outcome(condition))
+
+
+def runs_of(spec: StudySpec, root: Path) -> list[SimulatedRun]:
+    """Every run of a study, seed by seed, so that a study that was cut off has whole seeds."""
+    return [
+        SimulatedRun(root.absolute(), arm, seed, comparison.conditions, task, spec.budget)
+        for seed in spec.seeds
+        for comparison in spec.comparisons
+        for task in comparison.tasks
+        for arm in comparison.arms
+    ]
+
+
+def from_json(content: dict[str, Any]) -> SimulatedRun:
+    """The run that `to_json` wrote."""
+    return SimulatedRun(
+        Path(content["root"]),
+        content["arm_name"],
+        content["seed"],
+        tuple(content["conditions"]),
+        content["task"],
+        Budget(**content["budget"]),
+    )

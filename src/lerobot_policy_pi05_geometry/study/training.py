@@ -1,0 +1,16 @@
+"""LeRobot's training entry point, called from a run."""
+
+import sys
+
+from lerobot.scripts.lerobot_train import train
+
+from .frames_in_memory import train_in_memory
+
+
+def train_with(arguments: list[str], in_memory: bool = True) -> None:
+    """Train in this process with lerobot-train's arguments; LeRobot parses the command line itself.
+
+    in_memory: keep decoded frames in memory (images that fit; see frames_in_memory.py), or read them as LeRobot does.
+    """
+    sys.argv = ["lerobot-train", *arguments]
+    (train_in_memory if in_memory else train)()

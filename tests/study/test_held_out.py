@@ -1,0 +1,111 @@
+"""A study on a user's own dataset: what is held out, what is compared, and what comes out."""
+
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_policy_pi05_geometry.loading import LoadedPolicy
+from lerobot_policy_pi05_geometry.sim.record import record
+from lerobot_policy_pi05_geometry.study.held_out import (
+    ALL_CAMERAS,
+    NO_DEPTH,
+    ONLY,
+    action_errors,
+    held_out_runs,
+    hide_depth,
+    view_conditions,
+)
+
+pytestmark = pytest.mark.sim
+FRONT_DEPTH, WRIST_DEPTH = "observation.images.front_depth", "observation.images.wrist_depth"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """A dataset of five short episodes."""
+    folder = tmp_path_factory.mktemp("data") / "mine"
+    for _ in record(folder, "local/mine", "button-press-topdown-wide", episodes=5, image_size=28):
+        pass
+    return folder
+
+
+def test_errors_are_those_of_the_frames_that_are_there(root):
+    """A policy that always predicts zero is off by the mean size of the recorded actions; padding does not count."""
+    chunk = 6
+    deltas = {"action": [i / 20 for i in range(chunk)]}
+    dataset = LeRobotDataset("local/mine", root=root, episodes=[3, 4], delta_timestamps=deltas)
+    config = SimpleNamespace(chunk_size=chunk, max_action_dim=4, device="cpu")
+    nothing = SimpleNamespace(
+        config=config, reset=lambda: None, predict_action_chunk=lambda batch, noise: torch.zeros_like(noise)
+    )
+    loaded = LoadedPolicy(nothing, preprocess=lambda batch: batch, postprocess=lambda step: step)
+    frames = 7
+    errors = action_errors(loaded, dataset, ALL_CAMERAS, frames)
+    episode_of = np.array(dataset.hf_dataset["episode_index"])
+    actions = np.stack(dataset.hf_dataset["action"])
+    for e, episode in enumerate((3, 4)):
+        own = np.abs(actions[episode_of == episode])
+        chosen = np.unique(np.linspace(0, len(own) - 1, frames).astype(int))
+        for step in range(chunk):
+            there = [own[i + step] for i in chosen if i + step < len(own)]
+            np.testing.assert_allclose(errors[e, step], np.mean(there, axis=0), rtol=1e-5)
+
+
+def test_hidden_depth_measures_nothing_and_the_rest_stays():
+    batch = {
+        FRONT_DEPTH: torch.ones(2, 1, 3, 3),
+        WRIST_DEPTH: torch.ones(2, 1, 3, 3),
+        "observation.state": torch.ones(2),
+    }
+    for condition, front, wrist in ((ALL_CAMERAS, 1, 1), (NO_DEPTH, 0, 0), (f"{ONLY}front", 1, 0)):
+        shown = hide_depth(batch, condition)
+        assert (shown[FRONT_DEPTH] == front).all(), condition
+        assert (shown[WRIST_DEPTH] == wrist).all(), condition
+        assert shown["observation.state"] is batch["observation.state"]
+    assert (batch[FRONT_DEPTH] == 1).all()
+
+
+def test_what_cannot_be_studied_is_named(root, tmp_path):
+    def runs(folder=root, arms=("geometry",), held_out=0.2):
+        return held_out_runs(tmp_path, folder, "local/mine", arms, [0], {}, 4, held_out, 3)
+
+    assert view_conditions(root, "local/mine") == [ALL_CAMERAS, NO_DEPTH]
+    assert runs()[0].own_conditions() == [ALL_CAMERAS, NO_DEPTH]
+    assert runs(arms=("rgb",))[0].own_conditions() == [ALL_CAMERAS]
+    with pytest.raises(FileNotFoundError, match="holds no LeRobotDataset"):
+        runs(folder=tmp_path)
+    with pytest.raises(ValueError, match="only the simulator has"):
+        runs(arms=("rgb-wide",))
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        runs(held_out=1.0)
+
+
+@pytest.mark.train
+def test_a_study_of_a_dataset_end_to_end(root, tmp_path):
+    arguments = [
+        "study", f"--dataset.root={root}", "--output", str(tmp_path), "--arms=blind,rgb,geometry", "--seeds=0,1", "--steps=2",
+        "--held-out=0.4", "--frames=3", "--policy.device=cpu", "--policy.paligemma_variant=tiny",
+        "--policy.action_expert_variant=tiny", "--policy.image_resolution=[28, 28]", "--policy.chunk_size=4",
+        "--policy.n_action_steps=4", "--batch_size=4",
+    ]  # fmt: skip
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
+    command = [sys.executable, "-m", "lerobot_policy_pi05_geometry.cli", *arguments]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
+    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-2000:]
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<img ") == 2
+    assert "open-loop error, not success" in page
+    table = pd.read_csv(tmp_path / "errors.csv")
+    views = table.groupby("arm")["condition"].unique().map(set).to_dict()
+    assert views == {"blind": {ALL_CAMERAS}, "rgb": {ALL_CAMERAS}, "geometry": {ALL_CAMERAS, NO_DEPTH}}
+    assert set(table["episode"]) == {0, 1}  # two of five are held out
+    assert len(table) == (1 + 1 + 2) * 2 * 2 * 4 * 4  # views, seeds, episodes, steps ahead, dimensions
+    geometry = table[(table["arm"] == "geometry") & (table["training_seed"] == 0)].set_index(["condition"])["error"]
+    assert not np.allclose(geometry[ALL_CAMERAS], geometry[NO_DEPTH])
