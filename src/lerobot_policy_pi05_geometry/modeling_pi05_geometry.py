@@ -55,7 +55,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     ) -> None:
         """dataset_stats, dataset_meta: what LeRobot's `make_policy` passes; the rest of it is not needed.
 
-        encoder: for geometry_source=da3, an encoder that is loaded already; None: load what the configuration names.
+        encoder: for geometry_source=da3, what `load_da3` returned for this configuration; None: it is called here.
         """
         super().__init__(config)
         config.validate_features()
