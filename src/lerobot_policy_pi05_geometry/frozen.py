@@ -88,6 +88,6 @@ def _warn_of_licence(encoder: str, variant: Da3Variant) -> None:
     if variant.non_commercial and encoder not in _warned:
         _warned.add(encoder)
         logger.warning(
-            "%s is Depth Anything 3's '%s', whose weights are released under CC BY-NC 4.0: not for commercial use, and so is "
-            "what is trained with them; SMALL and BASE are Apache-2.0.", encoder, variant.name,
+            "%s is Depth Anything 3's '%s', whose weights are released under CC BY-NC 4.0, so not for commercial use; "
+            "depth-anything/DA3-SMALL and DA3-BASE are Apache-2.0.", encoder, variant.name,
         )  # fmt: skip
