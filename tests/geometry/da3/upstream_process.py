@@ -21,7 +21,7 @@ PARTS = {"net": "backbone", "head": "head", "cam_enc": "cam_enc", "cam_dec": "ca
 def released_keys() -> dict[str, dict[str, list[int]]]:
     """Names, as in released files, and shapes of every model but the nested one, whose parts these are.
 
-    Gaussian splatting's adapter is left out: it has no parameters, and needs packages that pin numpy.
+    Gaussian splatting's adapter (`model.gs_adapter.`) is left out: it needs further packages.
     """
     from depth_anything_3.cfg import create_object, load_config
     from depth_anything_3.registry import MODEL_REGISTRY
