@@ -11,7 +11,9 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from lerobot_policy_pi05_geometry.frozen import backbone_hash
 from lerobot_policy_pi05_geometry.sim.record import record
+from tests.geometry.da3.tiny import write_tiny
 
 pytestmark = [pytest.mark.train, pytest.mark.sim]
 
@@ -43,8 +45,12 @@ def dataset(tmp_path_factory) -> Path:
 def trained(dataset, tmp_path_factory) -> tuple[Path, str]:
     """The output folder of 6 uninterrupted steps, saved after 3 and 6, and the log."""
     output = tmp_path_factory.mktemp("train") / "run"
-    log = lerobot(
-        "train",
+    return output, lerobot("train", *arguments(dataset, output, steps=6))
+
+
+def arguments(dataset: Path, output: Path, steps: int) -> list[str]:
+    """What to train, saved half way and at the end."""
+    return [
         "--policy.type=pi05_geometry",
         "--policy.device=cpu",
         "--policy.push_to_hub=false",
@@ -64,14 +70,13 @@ def trained(dataset, tmp_path_factory) -> tuple[Path, str]:
         "--eval_steps=3",
         "--max_eval_samples=4",
         f"--output_dir={output}",
-        "--steps=6",
-        "--save_freq=3",
+        f"--steps={steps}",
+        f"--save_freq={steps // 2}",
         "--log_freq=1",
         "--batch_size=4",
         "--num_workers=0",
         "--wandb.enable=false",
-    )
-    return output, log
+    ]
 
 
 def tensors(folder: Path) -> dict[str, torch.Tensor]:
@@ -142,3 +147,20 @@ def test_a_checkpoint_is_evaluated_in_the_environment(trained, tmp_path):
     info = json.loads((tmp_path / "evaluation" / "eval_info.json").read_text())
     assert info["overall"]["n_episodes"] == 2
     assert info["overall"]["pc_success"] in (0.0, 50.0, 100.0)
+
+
+def test_geometry_from_rgb_is_trained_and_resumed_bit_for_bit(dataset, tmp_path):
+    encoder = write_tiny(tmp_path / "encoder" / "model.safetensors").parent
+    output = tmp_path / "run"
+    rgb = ["--policy.geometry_source=da3", f"--policy.da3_encoder={encoder}", "--policy.da3_image_size=56"]
+    lerobot("train", *arguments(dataset, output, steps=2), *rgb)
+    checkpoints = output / "checkpoints"
+    config = json.loads((checkpoints / "last" / "pretrained_model" / "config.json").read_text())
+    assert config["da3_hash"] == backbone_hash(encoder / "model.safetensors")
+    shutil.move(checkpoints / "000002", tmp_path / "uninterrupted")
+    (checkpoints / "last").unlink()
+    lerobot("train", f"--config_path={checkpoints / '000001/pretrained_model/train_config.json'}", "--resume=true")
+    expected, found = tensors(tmp_path / "uninterrupted"), tensors(checkpoints / "000002")
+    assert found.keys() == expected.keys()
+    for name, tensor in expected.items():
+        assert torch.equal(found[name], tensor), name

@@ -5,7 +5,7 @@
    demo, inspect, sim                        the demo, its pictures, the simulated RGB-D robot
    configuration_, modeling_, processor_     LeRobot's three doors, thin
    loading                                   a checkpoint with its processors, for our commands
-   inputs, prompt, checkpoints               what arrives is checked; weights in, strictly
+   inputs, prompt, checkpoints, frozen       what arrives is checked; weights in, strictly
    geometry                                  observation -> geometry tokens
    model                                     the network
 ```

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from huggingface_hub import hf_hub_download
-from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
+from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError, RepositoryNotFoundError
 from safetensors import SafetensorError, safe_open
 from torch import nn
 
@@ -33,6 +33,10 @@ def find_file(model_id: str | Path, name: str, **hub: Any) -> Path:
         ) from error
     except EntryNotFoundError as error:
         raise FileNotFoundError(f"Checkpoint {model_id} on the hub has no {name}.") from error
+    except RepositoryNotFoundError as error:
+        raise FileNotFoundError(
+            f"There is no {model_id} on the hub, or your token does not open it; check the name, or log in with `hf auth login`."
+        ) from error
 
 
 def require_policy_type(model_id: str | Path, expected: str, **hub: Any) -> None:
@@ -49,18 +53,19 @@ def require_policy_type(model_id: str | Path, expected: str, **hub: Any) -> None
         )
 
 
-def load_strictly(module: nn.Module, path: str | Path) -> None:
+def load_strictly(module: nn.Module, path: str | Path, prefix: str = "", others: tuple[str, ...] = ()) -> None:
     """Fill `module` from a safetensors file, tensor by tensor, cast to the dtype each parameter is stored in.
 
     Everything is checked before anything is written. Parameters on the meta device become real ones, so no second copy
-    of the model is ever held.
+    of the model is ever held. prefix: what the module's names stand behind in the file. others: how the names of tensors
+    begin that the file may hold beside them, and that are left out.
 
     Raises ValueError for a file that is truncated, or tensors that are missing, unknown, or of a wrong shape or dtype.
     """
-    expected = module.state_dict()
+    expected = {prefix + name: tensor for name, tensor in module.state_dict().items()}
     try:
         with safe_open(path, framework="pt") as file:
-            names = set(file.keys())
+            names = {name for name in file.keys() if not name.startswith(others)}  # noqa: SIM118
             _complain(path, "lacks", sorted(set(expected) - names))
             _complain(path, "has unknown", sorted(names - set(expected)))
             wrong = []
@@ -74,7 +79,7 @@ def load_strictly(module: nn.Module, path: str | Path) -> None:
             _complain(path, "has wrong", wrong)
             for name, target in expected.items():
                 # A clone, not the memory-mapped file, which could be overwritten beneath a running policy.
-                _assign(module, name, file.get_tensor(name).to(target.dtype).clone())
+                _assign(module, name.removeprefix(prefix), file.get_tensor(name).to(target.dtype).clone())
     except SafetensorError as error:
         raise ValueError(f"{path} is truncated or no safetensors file ({error}); copy or download it again.") from error
 

@@ -34,7 +34,8 @@ _CHOICES = {
     "dtype": tuple(DTYPES),
     "param_dtype": tuple(DTYPES),
     "depth_unit": tuple(METRES_PER_UNIT),
-    "geometry_source": ("none", "rgbd", "random"),
+    "geometry_source": ("none", "rgbd", "da3", "random"),
+    "da3_dtype": tuple(DTYPES),
     "geometry_frame": ("base", "camera"),
     "geometry_time": get_args(GeometryTime),
     "geometry_positions": get_args(GeometryPositions),
@@ -60,8 +61,8 @@ class PI05GeometryConfig(PreTrainedConfig):
     max_action_dim: int = 32
 
     # Geometry
-    geometry_source: str = "rgbd"  # none (plain π0.5), rgbd (depth cameras), random (control)
-    geometry_cameras: list[str] | None = None  # names in token order; None: every camera that has depth
+    geometry_source: str = "rgbd"  # none (plain π0.5), rgbd (depth cameras), da3 (RGB cameras), random (control)
+    geometry_cameras: list[str] | None = None  # names in token order; None: every camera that has depth, or RGB for da3
     geometry_grid: int = 8  # cells per side and camera
     geometry_frame: str = "base"  # points in the robot's base frame, or in the camera's
     geometry_time: str = "clean"  # flow time that conditions geometry: clean (cached) or denoise (recomputed)
@@ -78,6 +79,14 @@ class PI05GeometryConfig(PreTrainedConfig):
     geometry_features: dict[str, PolicyFeature] = field(
         default_factory=dict
     )  # depth and poses, set by validate_features
+
+    # Depth Anything 3, for geometry_source=da3 (docs/geometry-from-rgb.md)
+    da3_encoder: str = "depth-anything/DA3-BASE"  # hub id, folder or safetensors file
+    da3_hash: str | None = None  # SHA-256 of its backbone, recorded at first use and verified ever after
+    da3_image_size: int | None = (
+        None  # pixels per side, a multiple of 14 * geometry_grid; None: the smallest from 196 on
+    )
+    da3_dtype: str = "bfloat16"  # what it computes in; float32 for comparisons
 
     # Tokenizer folder or hub id; None: PaliGemma's from the hub, or the built-in one for the small sizes.
     tokenizer_path: str | None = None
@@ -247,6 +256,21 @@ class PI05GeometryConfig(PreTrainedConfig):
             raise ValueError(
                 f"geometry_cameras names {', '.join(unknown)}, but the data has depth from "
                 f"{', '.join(sorted(found)) or 'no camera'} only (keys {prefix}<camera>{DEPTH_SUFFIX})."
+            )
+        return {camera: found[camera] for camera in self.geometry_cameras}
+
+    def rgb_cameras(self) -> dict[str, str]:
+        """RGB cameras that geometry looks through, in token order, and the key of their images."""
+        prefixes = f"{OBS_IMAGES}.", "observation."
+        keys = sorted(key for key in self.image_features if not key.startswith(EMPTY_CAMERA))
+        found = {key.removeprefix(prefixes[0]).removeprefix(prefixes[1]): key for key in keys}
+        if self.geometry_cameras is None:
+            return found
+        unknown = [camera for camera in self.geometry_cameras if camera not in found]
+        if unknown:
+            raise ValueError(
+                f"geometry_cameras names {', '.join(unknown)}, but the data has RGB images from "
+                f"{', '.join(found) or 'no camera'} only."
             )
         return {camera: found[camera] for camera in self.geometry_cameras}
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from .configuration_pi05_geometry import PI05GeometryConfig
 from .geometry import CameraCalibration, read_calibration_file
 from .geometry.calibration import CALIBRATION_FILE
+from .geometry.images import rgb_image
 from .geometry.keys import extrinsics_key
 from .quantiles import WIDE_ENOUGH, covered
 
@@ -49,13 +50,7 @@ def prepare_images(
 
 
 def _prepare_image(image: Tensor, key: str, config: PI05GeometryConfig) -> Tensor:
-    if image.ndim == 4 and image.shape[1] != 3 and image.shape[-1] == 3:
-        image = image.permute(0, 3, 1, 2)
-    if image.ndim != 4 or image.shape[1] != 3:
-        raise ValueError(
-            f"{key} must be RGB images (B, 3, H, W), got shape {tuple(image.shape)}; depth needs a name that ends in _depth."
-        )
-    image = image.float() / 255 if image.dtype == torch.uint8 else image.float()
+    image = rgb_image(image, key)
     if tuple(image.shape[-2:]) != tuple(config.image_resolution):
         image = resize_with_pad_torch(image, *config.image_resolution)
     return image * 2.0 - 1.0

@@ -25,7 +25,9 @@ from torch import Tensor, nn
 
 from .checkpoints import find_file, load_strictly, require_policy_type
 from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
+from .frozen import load_da3
 from .geometry import GeometryEncoder, GeometrySource
+from .geometry.da3 import Da3Encoder, Da3Source
 from .geometry.random_tokens import RandomSource
 from .geometry.rgbd import RgbdSource
 from .inputs import check_calibration, check_stats, prepare_images, resolve_calibration
@@ -49,9 +51,13 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         config: PI05GeometryConfig,
         dataset_stats: dict[str, dict[str, Any]] | None = None,
         dataset_meta: Any | None = None,
+        encoder: Da3Encoder | None = None,
         **_: Any,
     ) -> None:
-        """dataset_stats, dataset_meta: what LeRobot's `make_policy` passes; the rest of it is not needed."""
+        """dataset_stats, dataset_meta: what LeRobot's `make_policy` passes; the rest of it is not needed.
+
+        encoder: for geometry_source=da3, what `load_da3` returned for this configuration; None: it is called here.
+        """
         super().__init__(config)
         config.validate_features()
         if dataset_stats:
@@ -59,7 +65,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self.config: PI05GeometryConfig = config
         self.init_rtc_processor()
         self.model = PI05Pytorch(config.network(), self.rtc_processor)
-        source = self._build_source(dataset_meta)
+        source = self._build_source(dataset_meta, encoder)
         self.geometry = None if source is None else GeometryEncoder(source, self.model.geometry_width)
         if config.tokenizer == SMALL_TOKENIZER and not self.model.action_in_proj.weight.is_meta:
             self.model.paligemma_with_expert.language_model.start_numbers_in_order(small_number_ids())
@@ -74,11 +80,13 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             self.to(config.device)
         self.reset()
 
-    def _build_source(self, dataset_meta: Any | None) -> GeometrySource | None:
+    def _build_source(self, dataset_meta: Any | None, encoder: Da3Encoder | None) -> GeometrySource | None:
         """The geometry source that the configuration names; records the calibration in the configuration."""
         config = self.config
         if config.geometry_source == "none":
             return None
+        if config.geometry_source == "da3":
+            return self._build_da3(encoder)
         sizes = config.depth_cameras()
         if config.geometry_source == "random":
             cameras = tuple(sizes) or tuple(key.rsplit(".", 1)[-1] for key in config.image_features)
@@ -104,6 +112,21 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             base_frame=config.geometry_frame == "base",
             unit=config.depth_unit,
             max_depth=config.max_depth,
+        )
+
+    def _build_da3(self, encoder: Da3Encoder | None) -> Da3Source:
+        config = self.config
+        keys = config.rgb_cameras()
+        if not keys:
+            raise ValueError(
+                "geometry_source=da3 looks at RGB images, but the data has none; use geometry_source=none."
+            )
+        return Da3Source(
+            keys,
+            config.geometry_grid,
+            load_da3(config) if encoder is None else encoder,
+            config.da3_image_size,
+            optional={camera for camera, key in keys.items() if config.may_be_absent(key)},
         )
 
     def _set_trainable(self) -> None:
@@ -146,6 +169,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         weights = find_file(pretrained_name_or_path, SAFETENSORS_SINGLE_FILE, **hub)
         if config is None:
             config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, **hub)
+        if isinstance(config, PI05GeometryConfig) and config.geometry_source == "da3":
+            kwargs["encoder"] = load_da3(config)  # before, since in there every parameter becomes an empty one
         with init_empty_weights(include_buffers=False):
             policy = cls(config, **kwargs)
         load_strictly(policy, weights)

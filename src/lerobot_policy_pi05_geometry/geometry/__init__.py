@@ -7,7 +7,8 @@
 
    depth         raw depth of any layout and unit -> metres and valid pixels
    camera        calibration, point maps, rigid transforms        calibration   the JSON file
-   source        the contract                                     rgbd, random_tokens   two sources
+   source        the contract                                     rgbd, random_tokens   sources
+   images        RGB of any layout -> (B, 3, H, W)                da3           a frozen encoder of RGB images, as a source
    adapter       features -> tokens, trainable                    encoder       source + adapter, and failing cameras
 ```
 

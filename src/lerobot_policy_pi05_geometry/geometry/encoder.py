@@ -1,8 +1,8 @@
-"""Source and adapter together, and what to do when a depth camera fails.
+"""Source and adapter together, and what to do when a camera that geometry needs fails.
 
 In training, a missing camera or a frame of NaN is an error: the data is wrong. On a robot it is weather: once geometry has
 been seen, a camera that goes silent (its key is missing, or no pixel is valid) is masked, said once, and used again when
-it returns. A robot that never had a depth key is misconfigured, which is an error again.
+it returns. A robot that never had its key is misconfigured, which is an error again.
 """
 
 import logging
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ..model.precision import compute_in_float32
 from .adapter import GeometryAdapter
-from .keys import batch_like, depth_key, extrinsics_key
+from .keys import batch_like
 from .source import GeometryFeatures, GeometrySource
 
 logger = logging.getLogger(__name__)
@@ -40,18 +40,18 @@ class GeometryEncoder(nn.Module):
             return self.adapter(self._measured(batch) if self.training else self._live(batch))
 
     def _measured(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
-        """Features of a training batch, where every camera must be there."""
-        missing = self.source.missing_cameras(batch)
+        """Features of a training batch, where every camera must be there, but for optional ones."""
+        missing = [camera for camera in self.source.missing_cameras(batch) if camera not in self.source.optional]
         if missing:
-            raise ValueError(_missing_message(missing))
+            raise ValueError(self.source.missing_message(missing))
         return self.source(batch, check=True)
 
     def _live(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
         """Features at inference: a camera that fails is masked, once it has been seen."""
         missing = self.source.missing_cameras(batch)
-        unknown = [camera for camera in missing if camera not in self._seen]
+        unknown = [camera for camera in missing if camera not in self._seen | self.source.optional]
         if unknown:
-            raise ValueError(_missing_message(unknown))
+            raise ValueError(self.source.missing_message(unknown))
         if len(missing) == len(self.source.cameras):
             self._report(set(missing))
             return self._nothing(batch)
@@ -76,17 +76,7 @@ class GeometryEncoder(nn.Module):
     def _report(self, failed: set[str]) -> None:
         """Say once that a camera failed, and once that it is back."""
         for camera in sorted(failed - self._failed):
-            logger.warning("Depth camera '%s' gives no measurement: its geometry is masked until it returns.", camera)
+            logger.warning("Geometry camera '%s' gives nothing: its geometry is masked until it returns.", camera)
         for camera in sorted(self._failed - failed):
-            logger.info("Depth camera '%s' is back.", camera)
+            logger.info("Geometry camera '%s' is back.", camera)
         self._failed = failed
-
-
-def _missing_message(cameras: list[str]) -> str:
-    keys = ", ".join(depth_key(camera) for camera in cameras)
-    poses = ", ".join(extrinsics_key(camera) for camera in cameras)
-    return (
-        f"The observation has no depth from camera(s) {', '.join(cameras)}: expected {keys} (and, for a camera without "
-        f"extrinsics in its calibration, {poses}); connect the depth camera, rename its key with --rename_map, or train "
-        "with --policy.geometry_source=none."
-    )

@@ -49,6 +49,15 @@ class RgbdSource(GeometrySource):
             camera for camera in self.cameras if depth_key(camera) not in batch or not self._has_pose(camera, batch)
         ]
 
+    def missing_message(self, cameras: list[str]) -> str:
+        keys = ", ".join(depth_key(camera) for camera in cameras)
+        poses = ", ".join(extrinsics_key(camera) for camera in cameras)
+        return (
+            f"The observation has no depth from camera(s) {', '.join(cameras)}: expected {keys} (and, for a camera without "
+            f"extrinsics in its calibration, {poses}); connect the depth camera, rename its key with --rename_map, or train "
+            "with --policy.geometry_source=none."
+        )
+
     def _has_pose(self, camera: str, batch: Mapping[str, Tensor]) -> bool:
         known = not self.base_frame or self.calibration[camera].extrinsics is not None
         return known or extrinsics_key(camera) in batch

@@ -21,12 +21,14 @@ class GeometryFeatures(NamedTuple):
 class GeometrySource(nn.Module, ABC):
     """Turns an observation batch into per-cell features.
 
-    cameras: names of the V cameras in token order. grid: cells per side. feature_dim: C.
+    cameras: names of the V cameras in token order. grid: cells per side. feature_dim: C. optional: cameras that any
+    observation may lack; that any other is missing is an error in training, and a failure afterwards.
     """
 
     cameras: tuple[str, ...]
     grid: int
     feature_dim: int
+    optional: frozenset[str] = frozenset()
 
     @property
     def num_tokens(self) -> int:
@@ -36,6 +38,10 @@ class GeometrySource(nn.Module, ABC):
     @abstractmethod
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
         """Cameras for which this batch brings nothing to measure."""
+
+    def missing_message(self, cameras: list[str]) -> str:
+        """One sentence on what was expected from these cameras and what to do."""
+        return f"The observation has nothing from camera(s) {', '.join(cameras)}, which geometry needs; connect them."
 
     @abstractmethod
     def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
