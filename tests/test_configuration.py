@@ -240,3 +240,12 @@ def test_variants_of_two_families_do_not_go_together(vlm, expert):
     else:
         with pytest.raises(ValueError, match=r"share one attention.*gemma_2b with gemma_300m"):
             make_config(paligemma_variant=vlm, action_expert_variant=expert)
+
+
+def test_an_absent_camera_that_the_data_does_not_know_is_named():
+    config = make_config(absent_cameras=["wrist"])
+    with pytest.raises(ValueError, match=rf"absent_cameras names wrist, but the data has .*{WRIST}; give a whole key"):
+        config.validate_features()
+    config = make_config(absent_cameras=[WRIST])
+    config.validate_features()
+    config.validate_features()  # LeRobot does so several times

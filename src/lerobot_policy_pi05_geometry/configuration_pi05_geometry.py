@@ -229,6 +229,11 @@ class PI05GeometryConfig(PreTrainedConfig):
         for key in self.absent_cameras:
             if key in inputs:
                 self.optional_cameras[key] = inputs.pop(key)
+            elif inputs and key not in self.optional_cameras:
+                cameras = ", ".join(k for k, feature in inputs.items() if feature.type is FeatureType.VISUAL)
+                raise ValueError(
+                    f"absent_cameras names {key}, but the data has {cameras or 'no camera'}; give a whole key."
+                )
         if OBS_STATE not in inputs:
             inputs[OBS_STATE] = PolicyFeature(type=FeatureType.STATE, shape=(self.max_state_dim,))
         self.input_features = inputs

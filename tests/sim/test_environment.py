@@ -18,6 +18,7 @@ from lerobot_policy_pi05_geometry.quantiles import write_frame_quantiles
 from lerobot_policy_pi05_geometry.sim.cameras import CAMERA_RANGES, LOOK_AT
 from lerobot_policy_pi05_geometry.sim.configuration import MetaworldRgbdEnv
 from lerobot_policy_pi05_geometry.sim.environment import CAMERA, DEPTH_KEY, EXTRINSICS_KEY, RgbdMetaworldEnv
+from lerobot_policy_pi05_geometry.sim.headless import mujoco
 from lerobot_policy_pi05_geometry.sim.record import FIRST_SEED, record
 from lerobot_policy_pi05_geometry.sim.tasks import WIDE_TASKS, find_task, make_expert
 
@@ -378,3 +379,14 @@ def test_a_sensor_changes_what_is_measured_and_nothing_else(sensor):
 def test_an_unknown_sensor_is_named():
     with pytest.raises(ValueError, match="no depth sensor 'broken'"):
         RgbdMetaworldEnv("button-press-topdown-wide", sensor="broken")
+
+
+def test_an_environment_whose_renderer_does_not_start_can_be_closed(monkeypatch):
+    def no_context(*_):
+        raise RuntimeError("no rendering context")
+
+    monkeypatch.setattr(mujoco, "Renderer", no_context)
+    environment = RgbdMetaworldEnv(TASK)
+    with pytest.raises(RuntimeError, match="no rendering context"):
+        environment.reset(seed=0)
+    environment.close()

@@ -67,11 +67,11 @@ class RgbdMetaworldEnv(gym.Env):
         self._simulator: Any = None  # built on first use, so that worker processes get a rendering context of their own
 
     def _start(self) -> None:
-        self._simulator = make_simulator(self._spec)
-        model = self._simulator.model
-        model.vis.quality.offsamples = 0  # with multisampling off, software rendering is ten times as fast
-        self._renderer = mujoco.Renderer(model, self.image_size, self.image_size)
-        self.calibration = {CAMERA: intrinsics(model, self.image_size)}
+        simulator = make_simulator(self._spec)
+        simulator.model.vis.quality.offsamples = 0  # with multisampling off, software rendering is ten times as fast
+        self._renderer = mujoco.Renderer(simulator.model, self.image_size, self.image_size)
+        self.calibration = {CAMERA: intrinsics(simulator.model, self.image_size)}
+        self._simulator = simulator  # last: an environment whose renderer did not start has nothing to close
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         super().reset(seed=seed)
