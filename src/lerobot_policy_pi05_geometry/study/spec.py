@@ -31,7 +31,7 @@ class Budget:
     episodes: int = 200  # of the expert, to learn from
     steps: int = 1500
     batch_size: int = 16
-    learning_rate: float = 2e-3
+    learning_rate: float = 1e-3
     flow_samples: int = 4
     chunk_size: int = 8
     action_steps: int = 2  # of a chunk, before the next one is predicted
