@@ -8,6 +8,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from .geometry.camera import CameraCalibration
 from .geometry.depth import METRES_PER_UNIT, MIN_DEPTH
@@ -77,6 +78,8 @@ class PI05GeometryConfig(PreTrainedConfig):
     geometry_features: dict[str, PolicyFeature] = field(
         default_factory=dict
     )  # depth and poses, set by validate_features
+    # Depth cameras that a converted checkpoint has embeddings for, before any data has named them; then 0.
+    geometry_pending: int = 0
 
     # Tokenizer folder or hub id; None: PaliGemma's from the hub, or the built-in one for the small sizes.
     tokenizer_path: str | None = None
@@ -195,7 +198,14 @@ class PI05GeometryConfig(PreTrainedConfig):
         )
 
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
-        """LeRobot calls this with a dataset's features: a depth map under another name would pass for an RGB camera."""
+        """LeRobot calls this with a dataset's features, before it builds the policy.
+
+        A depth map under another name would pass for an RGB camera. A converted checkpoint learns its depth cameras here:
+        LeRobot takes features from the data only where a checkpoint has none.
+        """
+        if self.geometry_pending:
+            geometry = {key: feature for key, feature in features.items() if is_geometry_key(key)}
+            self.geometry_features = dataset_to_policy_features(geometry)
         for key, feature in features.items():
             info = feature.get("info") or {}
             depth = info.get("is_depth_map") or info.get("video.is_depth_map")
@@ -242,7 +252,7 @@ class PI05GeometryConfig(PreTrainedConfig):
             for key, feature in self.geometry_features.items()
             if key.startswith(prefix)
         }
-        if self.geometry_cameras is None:
+        if self.geometry_cameras is None or (self.geometry_pending and not found):
             return dict(sorted(found.items()))
         unknown = [camera for camera in self.geometry_cameras if camera not in found]
         if unknown:

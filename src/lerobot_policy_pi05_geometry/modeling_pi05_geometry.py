@@ -28,6 +28,7 @@ from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
 from .geometry import GeometryEncoder, GeometrySource
 from .geometry.random_tokens import RandomSource
 from .geometry.rgbd import RgbdSource
+from .geometry.unknown_cameras import UnknownCameras
 from .inputs import check_calibration, check_stats, prepare_images, resolve_calibration
 from .model import PI05Pytorch
 from .model.flow import FlowDraw, draw_flow
@@ -77,13 +78,18 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if config.geometry_source == "none":
             return None
         sizes = config.depth_cameras()
+        if config.geometry_pending and sizes:
+            self._accept_cameras(list(sizes))
+        pending = tuple(config.geometry_cameras or (f"camera{i}" for i in range(config.geometry_pending)))
         if config.geometry_source == "random":
-            cameras = tuple(sizes) or tuple(key.rsplit(".", 1)[-1] for key in config.image_features)
+            cameras = tuple(sizes) or pending or tuple(key.rsplit(".", 1)[-1] for key in config.image_features)
             if not cameras:
                 raise ValueError(
                     "geometry_source=random makes tokens per camera, but the data has none; use geometry_source=none."
                 )
             return RandomSource(cameras, config.geometry_grid)
+        if not sizes and config.geometry_pending and dataset_meta is None:
+            return UnknownCameras(pending, config.geometry_grid)
         if not sizes:
             raise ValueError(
                 "geometry_source=rgbd needs depth, but the data has no observation.images.<camera>_depth; record depth "
@@ -102,6 +108,17 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             unit=config.depth_unit,
             max_depth=config.max_depth,
         )
+
+    def _accept_cameras(self, cameras: list[str]) -> None:
+        """The data has named the depth cameras of a converted checkpoint. Raises ValueError if they are not as many."""
+        if len(cameras) != self.config.geometry_pending:
+            names = ",".join(cameras)
+            raise ValueError(
+                f"The checkpoint was converted for {self.config.geometry_pending} depth camera(s), but the data has depth "
+                f"from {len(cameras)}: {names}; convert again with --geometry-cameras {names}, or choose among them with "
+                "--policy.geometry_cameras."
+            )
+        self.config.geometry_pending = 0
 
     def _set_trainable(self) -> None:
         network = self.model.paligemma_with_expert

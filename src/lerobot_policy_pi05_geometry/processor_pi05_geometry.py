@@ -42,9 +42,8 @@ def make_pi05_geometry_pre_post_processors(
     config.validate_features()  # depth and poses must not reach the normaliser, whoever builds processors first
     if dataset_stats:
         check_stats(config, dataset_stats)
-    small = config.paligemma_variant != "gemma_2b"
     tokenizer = PortableTokenizerProcessorStep(
-        tokenizer_name=config.tokenizer_path or (SMALL_TOKENIZER if small else PALIGEMMA_TOKENIZER),
+        tokenizer_name=config.tokenizer_path or default_tokenizer(config),
         max_length=config.tokenizer_max_length,
     )
     check_vocabulary(tokenizer, PALIGEMMA_VARIANTS[config.paligemma_variant].vocab_size)
@@ -70,3 +69,8 @@ def make_pi05_geometry_pre_post_processors(
             steps.to_cpu,
         ],
     )
+
+
+def default_tokenizer(config: PI05GeometryConfig) -> str:
+    """PaliGemma's, from the hub, for the released size; the built-in one for the others."""
+    return PALIGEMMA_TOKENIZER if config.paligemma_variant == "gemma_2b" else SMALL_TOKENIZER
