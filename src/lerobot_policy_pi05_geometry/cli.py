@@ -175,7 +175,7 @@ def convert(
     geometry_grid: Annotated[int, typer.Option(help="Cells per side and camera.")] = 8,
     geometry_frame: Annotated[str, typer.Option(help="Points in the robot's base frame, or camera.")] = "base",
     geometry_expert: Annotated[str, typer.Option(help="shared, or own: a copy of the action expert.")] = "shared",
-    geometry_gate: Annotated[float, typer.Option(help="Log-gate to start with; -8 is almost closed, 0 open.")] = -8.0,
+    geometry_gate: Annotated[float, typer.Option(help="Log-gate to start with; -16 is closed, 0 open.")] = -16.0,
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration file. Default: the training data's meta/calibration.json.")
     ] = None,

@@ -68,7 +68,7 @@ class PI05GeometryConfig(PreTrainedConfig):
     geometry_positions: str = "sequential"  # rotary positions: sequential, or parallel (the suffix as in π0.5)
     geometry_placement: str = "segment"  # a segment of its own, or in the VLM's prefix (comparison)
     geometry_expert: str = "shared"  # the action expert's weights, or an own expert
-    geometry_gate_init: float = 0.0  # log-gate at the start: 0 open, -8 almost closed
+    geometry_gate_init: float = 0.0  # log-gate at the start: 0 open, -16 closed (what `pi05-geometry convert` writes)
     geometry_dropout: float = 0.1  # probability that a training sample's whole geometry is masked
     depth_unit: str = "mm"  # unit of the depth that arrives: mm (LeRobot's default) or m
     max_depth: float = 10.0  # metres; farther counts as not measured
@@ -123,9 +123,11 @@ class PI05GeometryConfig(PreTrainedConfig):
     optimizer_eps: float = 1e-8
     optimizer_weight_decay: float = 0.01
     optimizer_grad_clip_norm: float = 1.0
-    # The group of new parameters (adapter with its embeddings, gate): π0.5's rate is for fine-tuning, and a gate with 8 units
-    # to travel would need 320,000 steps of it. No weight decay, which would open a negative gate.
+    # The new parameters (adapter with its embeddings, gate): π0.5's rate is for fine-tuning. No weight decay, which would
+    # open a negative gate. Adam moves the gate by about its rate each step: at 1e-3, 16 units take 16,000 steps, at 1e-2
+    # (what `pi05-geometry convert` writes) 1,600.
     geometry_lr: float = 1e-3
+    geometry_gate_lr: float = 1e-3
     geometry_eps: float = 1e-12  # a closed gate scales the adapter's gradients down
 
     scheduler_warmup_steps: int = 1_000

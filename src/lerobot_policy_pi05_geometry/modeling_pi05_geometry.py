@@ -35,6 +35,7 @@ from .model.flow import FlowDraw, draw_flow
 
 logger = logging.getLogger(__name__)
 
+GATE = ".geometry_gate."  # in the name of the gate's parameter
 _EVALUATION_STEP = -1  # evaluation loss draws the same noise at every training step, so that its curve is comparable
 
 
@@ -231,19 +232,20 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def new_parameters(self) -> dict[str, nn.Parameter]:
         """What π0.5 does not have: the adapter with its embeddings, and the gate."""
         named = dict(self.named_parameters())
-        return {k: p for k, p in named.items() if k.startswith("geometry.") or ".geometry_gate." in k}
+        return {k: p for k, p in named.items() if k.startswith("geometry.") or GATE in k}
 
     def get_optim_params(self) -> list[dict[str, Any]]:
-        """Two parameter groups: π0.5's, and the new parameters with their own rate, eps and no weight decay."""
-        new = [p for p in self.new_parameters().values() if p.requires_grad]
-        ids = {id(p) for p in new}
+        """Parameter groups: π0.5's, and the new parameters with rates of their own, their eps and no weight decay."""
+        new = {name: p for name, p in self.new_parameters().items() if p.requires_grad}
+        ids = {id(p) for p in new.values()}
         groups: list[dict[str, Any]] = [
             {"params": [p for p in self.parameters() if p.requires_grad and id(p) not in ids]}
         ]
-        if new:
-            groups.append(
-                {"params": new, "lr": self.config.geometry_lr, "eps": self.config.geometry_eps, "weight_decay": 0.0}
-            )
+        gate = [p for name, p in new.items() if GATE in name]
+        rest = [p for name, p in new.items() if GATE not in name]
+        for params, lr in ((rest, self.config.geometry_lr), (gate, self.config.geometry_gate_lr)):
+            if params:
+                groups.append({"params": params, "lr": lr, "eps": self.config.geometry_eps, "weight_decay": 0.0})
         return groups
 
     @torch.no_grad()
