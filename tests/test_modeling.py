@@ -195,7 +195,9 @@ def test_parameter_groups_hold_every_trainable_parameter_once(changes):
     groups = policy.get_optim_params()
     names = {id(parameter): name for name, parameter in policy.named_parameters()}
     grouped = [[names[id(p)] for p in group["params"]] for group in groups]
-    assert sorted(sum(grouped, [])) == sorted(n for n, p in policy.named_parameters() if p.requires_grad)
+    assert sorted(name for group in grouped for name in group) == sorted(
+        n for n, p in policy.named_parameters() if p.requires_grad
+    )
     assert set(grouped[1]) == {name for name in names.values() if name.startswith("geometry.")}
     assert set(grouped[2]) == {name for name in names.values() if "geometry_gate" in name}
     for group, lr in zip(groups[1:], (3e-4, 7e-3), strict=True):

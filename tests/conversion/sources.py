@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from benchmarks.lerobot_pi05 import build_lerobot_policy
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
 from lerobot.processor import (
@@ -156,8 +156,6 @@ def without_prefix(tensors: Tensors) -> Tensors:
 
 def load_on(folder: Path, features: dict[str, Any] | None = None, **changes: Any) -> PI05GeometryPolicy:
     """A converted checkpoint as LeRobot's `make_policy` builds it on a dataset with these features."""
-    from lerobot.configs import PreTrainedConfig
-
     config = PreTrainedConfig.from_pretrained(folder)
     config.device = "cpu"
     for name, value in changes.items():
@@ -166,13 +164,17 @@ def load_on(folder: Path, features: dict[str, Any] | None = None, **changes: Any
     return PI05GeometryPolicy.from_pretrained(folder, config=config)
 
 
-def observation(size: int = 2, seed: int = 0) -> dict[str, Any]:
-    """What both policies can act on, as preprocessors hand it over; with depth for ours."""
-    from tests.doors import make_batch
-
-    return make_batch(size, seed)
+def noise_of(batch: dict[str, Any], width: int = 8) -> Tensor:
+    """The noise that `tests.doors.chunk_of` starts from."""
+    return torch.randn(len(batch[TOKENS]), CHUNK, width, generator=torch.Generator().manual_seed(9))
 
 
-def lerobot_chunk(policy: PI05Policy, batch: dict[str, Any], noise: Tensor) -> Tensor:
+def lerobot_chunk(policy: PI05Policy, batch: dict[str, Any]) -> Tensor:
+    """LeRobot's action chunk from the same noise as `tests.doors.chunk_of`."""
     wanted = {key: batch[key] for key in (FRONT, WRIST, TOKENS, TOKEN_MASK)}
-    return policy.predict_action_chunk(wanted, noise=noise)
+    return policy.predict_action_chunk(wanted, noise=noise_of(batch))
+
+
+def folder_contents(folder: Path) -> set[str]:
+    """Everything in a folder, hidden leftovers too."""
+    return {path.name for path in folder.iterdir()}

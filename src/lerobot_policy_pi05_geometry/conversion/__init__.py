@@ -6,15 +6,15 @@
    settings      the configurations' fields, both ways
    processors    the processors' JSON and statistics, both ways
    start         values of the parameters that π0.5 does not have
-   convert       theirs -> ours
-   export        ours -> LeRobot's
+   to_ours       convert: theirs -> ours
+   to_lerobot    export: ours -> LeRobot's
 ```
 
 Weights are never loaded: bytes go from file to file in the dtype that they are stored in, so both ways are exact and need
 no memory to speak of. A checkpoint is written beside its place and renamed when it is complete.
 """
 
-from .convert import GeometryStart, convert
-from .export import export
+from .to_lerobot import export
+from .to_ours import GeometryStart, convert
 
 __all__ = ["GeometryStart", "convert", "export"]

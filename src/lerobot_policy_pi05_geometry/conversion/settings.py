@@ -45,8 +45,8 @@ def from_lerobot(source: Mapping[str, Any], path: object) -> dict[str, Any]:
     return settings | {"input_features": {key: value for key, value in inputs if not key.startswith(EMPTY_CAMERA)}}
 
 
-def from_openpi(source: Mapping[str, Any], max_action_dim: int, chunk_size: int | None, path: object) -> dict[str, Any]:
-    """Fields that an openpi checkpoint tells: from its config.json, where it has one, and its weights."""
+def from_openpi(source: Mapping[str, Any], chunk_size: int | None, path: object) -> dict[str, Any]:
+    """Fields that the config.json of an openpi checkpoint tells; {} where it has none. chunk_size: if it is given."""
     settings = {ours: source[theirs] for theirs, ours in _OPENPI.items() if theirs in source}
     chunk_size = chunk_size or settings.get("chunk_size")
     if chunk_size is None:
@@ -54,7 +54,7 @@ def from_openpi(source: Mapping[str, Any], max_action_dim: int, chunk_size: int 
             f"{path} does not say how many actions a chunk has (openpi's action_horizon), and neither do its weights; give "
             "--chunk-size."
         )
-    return settings | {"chunk_size": chunk_size, "n_action_steps": chunk_size, "max_action_dim": max_action_dim}
+    return settings | {"chunk_size": chunk_size, "n_action_steps": chunk_size}
 
 
 def make_config(settings: Mapping[str, Any], path: object) -> PI05GeometryConfig:
@@ -62,8 +62,9 @@ def make_config(settings: Mapping[str, Any], path: object) -> PI05GeometryConfig
     try:
         return draccus.decode(PI05GeometryConfig, {**settings, "device": "cpu"})
     except draccus.utils.ParsingError as error:
-        # draccus hides what a configuration says about its own values behind "couldn't instantiate".
-        raise ValueError(f"The settings of {path} do not fit this policy: {error.__cause__ or error}") from error
+        # draccus names a field of a wrong type, but hides what a configuration says about its own values.
+        told = error if isinstance(error, draccus.utils.DecodingError) else error.__cause__ or error
+        raise ValueError(f"The settings of {path} do not fit this policy: {told}") from error
 
 
 def save_config(config: PreTrainedConfig, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -100,8 +101,7 @@ def convert(
     stored = read_tensors(file)
     parameters = {name: stored[theirs] for name, theirs in find_parameters(file, stored).items()}
     if kind is None:
-        action = parameters.get("action_in_proj.weight")
-        carried = from_openpi(described_by, action.shape[-1] if action is not None else 32, chunk_size, source)
+        carried = from_openpi(described_by, chunk_size, source) | _sizes_of(parameters)
     else:
         carried = from_lerobot(described_by, described)
     if features_from_data:
@@ -135,6 +135,21 @@ def _configure(carried: Mapping[str, Any], geometry: GeometryStart, source: obje
         config.calibration = read_calibration_file(geometry.calibration)
         config.calibration_given = True
     return config
+
+
+def _sizes_of(parameters: Mapping[str, StoredTensor]) -> dict[str, Any]:
+    """The settings that weights tell, where they are well formed; what is not is named when the weights are checked."""
+    vision = "paligemma_with_expert.paligemma.model.vision_tower.vision_model.embeddings."
+    sizes: dict[str, Any] = {}
+    action = parameters.get("action_out_proj.bias")
+    if action is not None and len(action.shape) == 1:
+        sizes["max_action_dim"] = action.shape[0]
+    patches = parameters.get(f"{vision}position_embedding.weight")
+    kernel = parameters.get(f"{vision}patch_embedding.weight")
+    if patches is not None and kernel is not None and patches.shape and kernel.shape:
+        side = math.isqrt(patches.shape[0]) * kernel.shape[-1]
+        sizes["image_resolution"] = [side, side]
+    return sizes
 
 
 def _check_variants(path: Path, config: PI05GeometryConfig, found: Mapping[str, StoredTensor]) -> None:
