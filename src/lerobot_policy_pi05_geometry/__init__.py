@@ -4,7 +4,7 @@
    cli                                       the pi05-geometry command
    demo, inspect, sim                        the demo, its pictures, the simulated RGB-D robot
    configuration_, modeling_, processor_     LeRobot's three doors, thin
-   loading                                   a checkpoint with its processors, for our commands
+   loading, conversion                       a checkpoint with its processors, for our commands; π0.5 in and out
    inputs, prompt, checkpoints               what arrives is checked; weights in, strictly
    geometry                                  observation -> geometry tokens
    model                                     the network

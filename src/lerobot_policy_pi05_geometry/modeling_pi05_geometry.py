@@ -94,7 +94,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if not sizes:
             raise ValueError(
                 "geometry_source=rgbd needs depth, but the data has no observation.images.<camera>_depth; record depth "
-                "(LeRobot: use_depth=true on the camera), or train with --policy.geometry_source=none."
+                "(LeRobot: use_depth=true on the camera), or train with --policy.geometry_source=none (for a converted "
+                "checkpoint: convert it with --geometry-source none)."
             )
         config.calibration = resolve_calibration(config, dataset_meta)
         config.calibration_given = config.calibration_given or config.calibration_path is not None

@@ -80,5 +80,5 @@ def test_a_parameter_that_stands_there_twice_is_named(other):
 def test_a_pi0_is_recognised():
     pi0 = [name.replace("norm.dense.", "norm.") for name in NAMES if not name.endswith("dense.bias")]
     pi0 = [name.replace("time_mlp", "action_time_mlp") for name in pi0] + ["state_proj.weight", "state_proj.bias"]
-    with pytest.raises(ValueError, match="file is a π0, not a π0.5"):
+    with pytest.raises(ValueError, match=r"file is a π0, not a π0\.5"):
         find_parameters("file", pi0)

@@ -72,7 +72,7 @@ def test_the_tokenizer_travels_in_the_checkpoint(converted):
 
 
 def test_a_tokenizer_that_is_not_there_is_named(lerobot_source, tmp_path):
-    with pytest.raises(FileNotFoundError, match="Tokenizer folder ./nowhere is not there"):
+    with pytest.raises(FileNotFoundError, match=r"Tokenizer folder \./nowhere is not there"):
         convert(lerobot_source, tmp_path / "output", tokenizer="./nowhere")
     assert not list(tmp_path.iterdir())
 

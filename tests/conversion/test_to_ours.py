@@ -126,9 +126,15 @@ def test_settings_carry_over(lerobot_source, converted):
 
 def test_what_belongs_to_the_source_alone_does_not_carry_over(tmp_path, caplog):
     """A repository to push to, or the device of a machine, would surprise whoever trains the result."""
-    source = write_lerobot(tmp_path / "source", repo_id="them/theirs", device="cuda", empty_cameras=1, novelty=3,
-                           input_features={STATE: {"type": "STATE", "shape": [7]},
-                                           "observation.images.empty_camera_0": {"type": "VISUAL", "shape": [3, 28, 28]}})  # fmt: skip
+    empty = {"type": "VISUAL", "shape": [3, 28, 28]}
+    source = write_lerobot(
+        tmp_path / "source",
+        repo_id="them/theirs",
+        device="cuda",
+        empty_cameras=1,
+        novelty=3,
+        input_features={STATE: {"type": "STATE", "shape": [7]}, "observation.images.empty_camera_0": empty},
+    )
     convert(source, tmp_path / "output")
     assert "settings that this policy does not have, left out: novelty" in caplog.text
     config = json.loads((tmp_path / "output" / "config.json").read_text())

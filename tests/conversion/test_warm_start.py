@@ -109,7 +109,7 @@ def test_one_camera_is_whichever_the_data_has(lerobot_source, tmp_path):
 @pytest.mark.parametrize(
     ("cameras", "data", "said"),
     [
-        (None, ("a", "b"), "converted for 1 depth camera(s), but the data has depth from 2: a,b; convert again with --geometry-cameras a,b"),
+        (None, ("a", "b"), "1 depth camera(s), but the data has depth from 2: a,b; convert again with --geometry-cameras a,b"),
         (("a", "c"), ("a", "b"), "geometry_cameras names c, but the data has depth from a, b only"),
     ],
 )  # fmt: skip
