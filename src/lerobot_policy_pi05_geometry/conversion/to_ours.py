@@ -25,10 +25,10 @@ from .tensor_file import StoredTensor, check_weights, read_tensors, total_size, 
 
 logger = logging.getLogger(__name__)
 
-# Logits on keys that the network has never seen may be well above those on the ones it has: with random weights, 64 to 392
-# cells and a gate of -8, actions moved by up to 0.1, at -12 by 3e-3, at -16 by 5e-5. Invariant 9 allows 1e-3.
+# Logits on keys that the network has never seen may be well above those on the ones it has: with random weights
+# and a gate of -8, actions moved by up to 0.1, at -12 by 3e-3, at -16 by 5e-5 (docs/results.md). Invariant 9 allows 1e-3.
 CLOSED = -16.0
-GATE_LR = 1e-2
+GATE_LR = 1e-2  # so that the way to open takes some 1,600 steps
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,8 @@ class GeometryStart:
     """The geometry that a converted checkpoint starts with.
 
     source: rgbd, random or none. cameras: names of the depth cameras in token order; None for one camera whose name the
-    training data tells. calibration: a calibration file, or None if the training data has it. gate: log-gate, see
-    `CLOSED`. expert: shared, or own, a copy of the action expert. frame, grid: as in the
-    configuration.
+    training data tells. calibration: a calibration file, or None if the training data has it. gate: log-gate, see `CLOSED`.
+    expert: shared, or own, a copy of the action expert. frame, grid: as in the configuration.
     """
 
     source: str = "rgbd"
@@ -77,10 +76,10 @@ def convert(
 ) -> PI05GeometryConfig:
     """Write `output`, a folder that is not there yet; returns its configuration.
 
-    source: folder or hub id of a π0.5 checkpoint of LeRobot or openpi (PyTorch). features_from_data: leave
-    cameras and state to the training data, instead of the source's. chunk_size: actions per chunk, for an
-    openpi checkpoint that does not say. tokenizer: folder or hub id, None for the source's. seed: draws the adapter. hub:
-    arguments of `hf_hub_download`, such as `revision`.
+    source: folder or hub id of a π0.5 checkpoint of LeRobot or openpi (PyTorch). features_from_data: leave cameras
+    and state to the training data, instead of the source's. chunk_size: actions per chunk, for an openpi checkpoint that
+    does not say. tokenizer: folder or hub id, None for the source's. seed: draws the adapter. hub: arguments of
+    `hf_hub_download`, such as `revision`.
 
     Raises ValueError, FileNotFoundError, FileExistsError or OSError, with one sentence; then nothing is left behind.
     """
