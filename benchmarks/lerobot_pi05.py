@@ -4,15 +4,18 @@ This is the only file that patches LeRobot: its network hard-codes the sizes of 
 replaced while the network is built and restored afterwards; the code that runs is LeRobot's. Its layers assume 8 heads.
 """
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import draccus
 from lerobot.policies.pi05 import modeling_pi05
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
-from lerobot.policies.pi05.modeling_pi05 import PI05Pytorch
+from lerobot.policies.pi05.modeling_pi05 import PI05Policy, PI05Pytorch
 from torch import nn
 
 from lerobot_policy_pi05_geometry.model.variants import (
@@ -22,6 +25,8 @@ from lerobot_policy_pi05_geometry.model.variants import (
     PaliGemmaVariant,
 )
 
+# LeRobot refuses other names; `_built_at` swaps the sizes beneath them.
+_RELEASED = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
 # Matrices that π0.5 never reads, and that this package does not build.
 LM_HEADS = (
     "paligemma_with_expert.paligemma.lm_head.weight",
@@ -48,8 +53,7 @@ def build_lerobot_pi05(
     `PI05Config`, such as `train_expert_only`.
     """
     settings = PI05Config(
-        paligemma_variant="gemma_2b",  # LeRobot refuses other names; _built_at swaps the sizes beneath them
-        action_expert_variant="gemma_300m",
+        **_RELEASED,
         image_resolution=(image_size, image_size),
         chunk_size=chunk_size,
         n_action_steps=chunk_size,
@@ -61,6 +65,22 @@ def build_lerobot_pi05(
     )
     with _built_at(PALIGEMMA_VARIANTS[paligemma_variant], EXPERT_VARIANTS[action_expert_variant]):
         return PI05Pytorch(settings)
+
+
+def build_lerobot_policy(paligemma_variant: str, action_expert_variant: str, **config: Any) -> PI05Policy:
+    """LeRobot's policy at these sizes, freshly initialised. config: further fields of `PI05Config`."""
+    with _built_at(PALIGEMMA_VARIANTS[paligemma_variant], EXPERT_VARIANTS[action_expert_variant]):
+        return PI05Policy(PI05Config(**_RELEASED, **config))
+
+
+def load_lerobot_policy(folder: Path) -> PI05Policy:
+    """A checkpoint folder in LeRobot's layout, loaded by LeRobot, at the sizes that its config.json names."""
+    settings = json.loads((folder / "config.json").read_text())
+    sizes = PALIGEMMA_VARIANTS[settings["paligemma_variant"]], EXPERT_VARIANTS[settings["action_expert_variant"]]
+    del settings["type"]
+    with _built_at(*sizes):
+        config = draccus.decode(PI05Config, {**settings, **_RELEASED, "device": "cpu"})
+        return PI05Policy.from_pretrained(folder, config=config)
 
 
 def copy_weights(source: nn.Module, target: nn.Module) -> None:

@@ -3,13 +3,14 @@
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from lerobot_policy_pi05_geometry.checkpoints import find_file, load_strictly
+from lerobot_policy_pi05_geometry.checkpoints import find_file, find_optional_file, load_strictly, new_folder
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from tests.doors import make_policy
 
@@ -171,8 +172,13 @@ def test_another_policy_type_is_refused(saved, tmp_path):
     folder = shutil.copytree(saved, tmp_path / "pi05")
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"type": "pi05"}))
-    with pytest.raises(ValueError, match=rf"{folder} is a checkpoint of type 'pi05', not 'pi05_geometry'"):
+    with pytest.raises(ValueError, match=rf"{folder} is a checkpoint of type 'pi05', not 'pi05_geometry'") as caught:
         PI05GeometryPolicy.from_pretrained(folder)
+    assert f"pi05-geometry convert {folder} OUTPUT" in str(caught.value)
+    (folder / "config.json").write_text(json.dumps(config | {"type": "act"}))
+    with pytest.raises(ValueError, match="is a checkpoint of type 'act'") as caught:
+        PI05GeometryPolicy.from_pretrained(folder)
+    assert "convert" not in str(caught.value)
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]"], ids=["empty", "cut", "list"])
@@ -193,3 +199,34 @@ def test_geometry_settings_that_do_not_fit_the_weights_are_refused(saved):
 def test_a_file_is_found_in_its_folder(saved):
     assert find_file(saved, "config.json") == saved / "config.json"
     assert find_file(str(saved), "model.safetensors") == saved / "model.safetensors"
+
+
+def test_a_file_that_may_be_missing(saved, tmp_path):
+    assert find_optional_file(saved, "config.json") == saved / "config.json"
+    assert find_optional_file(saved, "other.json") is None
+    with pytest.raises(FileNotFoundError, match="nowhere is not there"):
+        find_optional_file(tmp_path / "nowhere", "config.json")
+
+
+@pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt])
+def test_a_new_folder_appears_whole_or_not_at_all(tmp_path, error):
+    output = tmp_path / "a" / "b" / "output"
+    (tmp_path / "a").mkdir()
+    raised = pytest.raises(error) if error else nullcontext()
+    with raised, new_folder(output, 10) as folder:
+        (folder / "file").write_text("content")
+        assert not output.exists()
+        if error:
+            raise error
+    if error:
+        assert list((tmp_path / "a").iterdir()) == []
+    else:
+        assert [path.name for path in output.parent.iterdir()] == ["output"]
+        assert (output / "file").read_text() == "content"
+        assert output.stat().st_mode & 0o777 == 0o755
+
+
+def test_a_folder_that_is_there_is_left_alone(tmp_path):
+    with pytest.raises(FileExistsError, match=f"{tmp_path} is there already"), new_folder(tmp_path, 0):
+        pass
+    assert tmp_path.is_dir()

@@ -1,10 +1,17 @@
 """What a user sees of a mistake: one sentence that names it, exit code 1, no traceback."""
 
+import json
 import os
 import subprocess
 import sys
 
 import pytest
+import torch
+from typer.testing import CliRunner
+
+from lerobot_policy_pi05_geometry.cli import app
+
+from .conversion.sources import folder_contents, write_lerobot
 
 
 def fail(*arguments: str) -> str:
@@ -28,3 +35,32 @@ def test_a_task_that_there_is_not(tmp_path):
 
 def test_a_dataset_that_is_none(tmp_path):
     assert "is no LeRobotDataset" in fail("inspect", str(tmp_path), f"--dataset.root={tmp_path}")
+
+
+def test_a_conversion_that_fails_leaves_nothing(tmp_path):
+    """Exit code 1, one sentence, no output."""
+    source = write_lerobot(tmp_path / "source", lambda tensors: tensors | {"model.stranger": torch.zeros(2)})
+    printed = fail("convert", str(source), str(tmp_path / "output"))
+    assert "has unknown tensors: model.stranger; nothing was written" in " ".join(printed.split())
+    assert folder_contents(tmp_path) == {"source"}
+
+
+def test_conversion_and_back(tmp_path):
+    source, policy, back = write_lerobot(tmp_path / "source"), tmp_path / "policy", tmp_path / "back"
+    options = [
+        "--geometry-cameras",
+        "front,wrist",
+        "--geometry-grid",
+        "5",
+        "--geometry-gate",
+        "-9",
+        "--features-from-data",
+    ]
+    for arguments in (["convert", str(source), str(policy), *options], ["export", str(policy), str(back)]):
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
+    config = json.loads((policy / "config.json").read_text())
+    assert config["geometry_cameras"] == ["front", "wrist"]
+    assert (config["geometry_grid"], config["geometry_gate_init"], config["input_features"]) == (5, -9, {})
+    assert json.loads((back / "config.json").read_text())["type"] == "pi05"
+    assert "there already" in fail("export", str(policy), str(back))

@@ -191,17 +191,20 @@ def test_a_sample_without_geometry_is_a_sample_of_the_plain_policy():
     "changes", [{}, {"train_expert_only": True}, {"freeze_vision_encoder": True}, {"geometry_expert": "own"}]
 )
 def test_parameter_groups_hold_every_trainable_parameter_once(changes):
-    policy = make_policy(geometry_lr=3e-4, geometry_eps=1e-11, **changes)
+    policy = make_policy(geometry_lr=3e-4, geometry_gate_lr=7e-3, geometry_eps=1e-11, **changes)
     groups = policy.get_optim_params()
     names = {id(parameter): name for name, parameter in policy.named_parameters()}
     grouped = [[names[id(p)] for p in group["params"]] for group in groups]
-    assert sorted(grouped[0] + grouped[1]) == sorted(n for n, p in policy.named_parameters() if p.requires_grad)
-    new = {name for name in names.values() if name.startswith("geometry.") or "geometry_gate" in name}
-    assert new <= set(grouped[1])
-    assert {k: v for k, v in groups[1].items() if k != "params"} == {"lr": 3e-4, "eps": 1e-11, "weight_decay": 0.0}
+    assert sorted(name for group in grouped for name in group) == sorted(
+        n for n, p in policy.named_parameters() if p.requires_grad
+    )
+    assert set(grouped[1]) == {name for name in names.values() if name.startswith("geometry.")}
+    assert set(grouped[2]) == {name for name in names.values() if "geometry_gate" in name}
+    for group, lr in zip(groups[1:], (3e-4, 7e-3), strict=True):
+        assert {k: v for k, v in group.items() if k != "params"} == {"lr": lr, "eps": 1e-11, "weight_decay": 0.0}
     assert set(groups[0]) == {"params"}
     optimizer = policy.config.get_optimizer_preset().build(groups)
-    assert [group["lr"] for group in optimizer.param_groups] == [2.5e-5, 3e-4]
+    assert [group["lr"] for group in optimizer.param_groups] == [2.5e-5, 3e-4, 7e-3]
 
 
 def test_a_policy_without_geometry_has_one_group():

@@ -11,9 +11,12 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from lerobot_policy_pi05_geometry.conversion import convert
 from lerobot_policy_pi05_geometry.frozen import backbone_hash
 from lerobot_policy_pi05_geometry.sim.record import record
 from tests.geometry.da3.tiny import write_tiny
+
+from .conversion.sources import write_lerobot
 
 pytestmark = [pytest.mark.train, pytest.mark.sim]
 
@@ -164,3 +167,45 @@ def test_geometry_from_rgb_is_trained_and_resumed_bit_for_bit(dataset, tmp_path)
     assert found.keys() == expected.keys()
     for name, tensor in expected.items():
         assert torch.equal(found[name], tensor), name
+
+
+@pytest.mark.parametrize("from_data", [False, True])
+def test_a_converted_pi05_trains_on_depth_that_it_has_never_seen(dataset, tmp_path, from_data):
+    """Depth cameras, calibration and statistics come from the data; cameras and state too, if they are left to it."""
+    front = {"type": "VISUAL", "shape": [3, SIZE, SIZE]}
+    state = {"type": "STATE", "shape": [7]}
+    source = write_lerobot(
+        tmp_path / "pi05", input_features={"observation.images.front": front, "observation.state": state}
+    )
+    converted = tmp_path / "converted"
+    convert(source, converted, features_from_data=from_data)
+    log = lerobot(
+        "train",
+        f"--policy.path={converted}",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--dataset.repo_id=local/tiny",
+        f"--dataset.root={dataset}",
+        f"--output_dir={tmp_path / 'run'}",
+        "--steps=2",
+        "--save_freq=2",
+        "--log_freq=1",
+        "--batch_size=4",
+        "--num_workers=0",
+        "--wandb.enable=false",
+    )
+    assert "gate_openness" in log or "loss" in log
+    folder = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    config = json.loads((folder / "config.json").read_text())
+    assert config["geometry_pending"] == 0
+    assert set(config["geometry_features"]) == {
+        "observation.images.front_depth",
+        "observation.calibration.front.extrinsics",
+    }
+    assert config["calibration"]["front"]["size"] == [SIZE, SIZE]
+    before, after = load_file(converted / "model.safetensors"), load_file(folder / "model.safetensors")
+    assert after["training_step"] == 2
+    for name in ("geometry.adapter.fc_in.weight", "model.paligemma_with_expert.geometry_gate.log_gate"):
+        assert not torch.equal(before[name], after[name]), name
+    statistics = load_file(next(folder.glob("*preprocessor*_normalizer_processor.safetensors")))
+    assert "observation.state.q99" in statistics

@@ -2,9 +2,9 @@
 
 ```
    cli                                       the pi05-geometry command
-   demo, inspect, sim                        the demo, its pictures, the simulated RGB-D robot
+   study, inspect, sim                       studies (the demo is the smallest), pictures, the simulated RGB-D robot
+   loading, conversion                       a checkpoint with its processors, for our commands; π0.5 in and out
    configuration_, modeling_, processor_     LeRobot's three doors, thin
-   loading                                   a checkpoint with its processors, for our commands
    inputs, prompt, checkpoints, frozen       what arrives is checked; weights in, strictly
    geometry                                  observation -> geometry tokens
    model                                     the network

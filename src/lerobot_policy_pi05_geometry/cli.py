@@ -281,6 +281,70 @@ def inspect(
     console.print(f"Open [bold]{output}[/bold]")
 
 
+@app.command()
+def convert(
+    source: Annotated[str, typer.Argument(help="π0.5 checkpoint of LeRobot or openpi (PyTorch): folder or hub id.")],
+    output: Annotated[Path, typer.Argument(help="Folder to write; it must not be there.")],
+    geometry_source: Annotated[str, typer.Option(help="rgbd, random (control) or none.")] = "rgbd",
+    geometry_cameras: Annotated[
+        str | None,
+        typer.Option(help="Depth cameras in token order, as front,wrist. Default: the one that the data has."),
+    ] = None,
+    geometry_grid: Annotated[int, typer.Option(help="Cells per side and camera.")] = 8,
+    geometry_frame: Annotated[str, typer.Option(help="Points in the robot's base frame, or camera.")] = "base",
+    geometry_expert: Annotated[str, typer.Option(help="shared, or own: a copy of the action expert.")] = "shared",
+    geometry_gate: Annotated[float, typer.Option(help="Log-gate to start with; -16 is closed, 0 open.")] = -16.0,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration file. Default: the training data's meta/calibration.json.")
+    ] = None,
+    features_from_data: Annotated[
+        bool, typer.Option("--features-from-data", help="Cameras and state as the training data names them.")
+    ] = False,
+    chunk_size: Annotated[
+        int | None, typer.Option(help="Actions per chunk, where an openpi source does not say.")
+    ] = None,
+    tokenizer_path: Annotated[
+        str | None, typer.Option(help="Tokenizer folder or hub id. Default: the one the source names.")
+    ] = None,
+    revision: Annotated[str | None, typer.Option(help="Revision of a hub id.")] = None,
+    seed: Annotated[int, typer.Option(help="Another seed draws another geometry adapter.")] = 0,
+) -> None:
+    """Start from a π0.5: write a checkpoint of this policy that acts as the source does, ready for --policy.path.
+
+    Weights, settings and processor statistics carry over. An openpi checkpoint brings weights only: cameras and
+    statistics then come from the data it is trained on.
+    """
+    from .conversion import GeometryStart
+    from .conversion import convert as run
+
+    geometry = GeometryStart(
+        source=geometry_source,
+        cameras=None if geometry_cameras is None else tuple(geometry_cameras.split(",")),
+        calibration=calibration,
+        grid=geometry_grid,
+        frame=geometry_frame,
+        expert=geometry_expert,
+        gate=geometry_gate,
+    )
+    run(
+        source, output, geometry, features_from_data=features_from_data, chunk_size=chunk_size,
+        tokenizer=tokenizer_path, seed=seed, revision=revision,
+    )  # fmt: skip
+    console.print(f"Train it: lerobot-train --policy.path={output} --dataset.repo_id=you/your_dataset ...")
+
+
+@app.command()
+def export(
+    checkpoint: Annotated[str, typer.Argument(help="Checkpoint folder (pretrained_model) or hub id of this policy.")],
+    output: Annotated[Path, typer.Argument(help="Folder to write; it must not be there.")],
+) -> None:
+    """The way back: write a checkpoint as LeRobot's own π0.5 (--policy.type=pi05), without its geometry."""
+    from .conversion import export as run
+
+    run(checkpoint, output)
+    console.print(f"LeRobot's π0.5 loads it: --policy.path={output}")
+
+
 def main() -> None:
     """Entry point: errors of the user's input are one sentence, not a traceback."""
     logging.basicConfig(

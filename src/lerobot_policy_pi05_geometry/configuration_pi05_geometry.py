@@ -8,6 +8,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from .geometry.camera import CameraCalibration
 from .geometry.depth import METRES_PER_UNIT, MIN_DEPTH
@@ -69,7 +70,7 @@ class PI05GeometryConfig(PreTrainedConfig):
     geometry_positions: str = "sequential"  # rotary positions: sequential, or parallel (the suffix as in π0.5)
     geometry_placement: str = "segment"  # a segment of its own, or in the VLM's prefix (comparison)
     geometry_expert: str = "shared"  # the action expert's weights, or an own expert
-    geometry_gate_init: float = 0.0  # log-gate at the start: 0 open, -8 almost closed
+    geometry_gate_init: float = 0.0  # log-gate at the start: 0 open, -16 closed (what `pi05-geometry convert` writes)
     geometry_dropout: float = 0.1  # probability that a training sample's whole geometry is masked
     depth_unit: str = "mm"  # unit of the depth that arrives: mm (LeRobot's default) or m
     max_depth: float = 10.0  # metres; farther counts as not measured
@@ -79,6 +80,8 @@ class PI05GeometryConfig(PreTrainedConfig):
     geometry_features: dict[str, PolicyFeature] = field(
         default_factory=dict
     )  # depth and poses, set by validate_features
+    # Depth cameras that a converted checkpoint has embeddings for, before any data has named them; then 0.
+    geometry_pending: int = 0
 
     # Depth Anything 3, for geometry_source=da3 (docs/geometry-from-rgb.md)
     da3_encoder: str = "depth-anything/DA3-BASE"  # hub id, folder or safetensors file
@@ -132,9 +135,11 @@ class PI05GeometryConfig(PreTrainedConfig):
     optimizer_eps: float = 1e-8
     optimizer_weight_decay: float = 0.01
     optimizer_grad_clip_norm: float = 1.0
-    # The group of new parameters (adapter with its embeddings, gate): π0.5's rate is for fine-tuning, and a gate with 8 units
-    # to travel would need 320,000 steps of it. No weight decay, which would open a negative gate.
+    # The new parameters (adapter with its embeddings, gate): π0.5's rate is for fine-tuning. No weight decay, which would
+    # open a negative gate. Adam moves the gate by about its rate each step: at 1e-3, 16 units take 16,000 steps, at 1e-2
+    # (what `pi05-geometry convert` writes) 1,600.
     geometry_lr: float = 1e-3
+    geometry_gate_lr: float = 1e-3
     geometry_eps: float = 1e-12  # a closed gate scales the adapter's gradients down
 
     scheduler_warmup_steps: int = 1_000
@@ -202,7 +207,14 @@ class PI05GeometryConfig(PreTrainedConfig):
         )
 
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
-        """LeRobot calls this with a dataset's features: a depth map under another name would pass for an RGB camera."""
+        """LeRobot calls this with a dataset's features, before it builds the policy.
+
+        A depth map under another name would pass for an RGB camera. A converted checkpoint learns its depth cameras here:
+        LeRobot takes features from the data only where a checkpoint has none.
+        """
+        if self.geometry_pending:
+            geometry = {key: feature for key, feature in features.items() if is_geometry_key(key)}
+            self.geometry_features = dataset_to_policy_features(geometry)
         for key, feature in features.items():
             info = feature.get("info") or {}
             depth = info.get("is_depth_map") or info.get("video.is_depth_map")
@@ -254,7 +266,7 @@ class PI05GeometryConfig(PreTrainedConfig):
             for key, feature in self.geometry_features.items()
             if key.startswith(prefix)
         }
-        if self.geometry_cameras is None:
+        if self.geometry_cameras is None or (self.geometry_pending and not found):
             return dict(sorted(found.items()))
         unknown = [camera for camera in self.geometry_cameras if camera not in found]
         if unknown:

@@ -30,6 +30,7 @@ from .geometry import GeometryEncoder, GeometrySource
 from .geometry.da3 import Da3Encoder, Da3Source
 from .geometry.random_tokens import RandomSource
 from .geometry.rgbd import RgbdSource
+from .geometry.unknown_cameras import UnknownCameras
 from .inputs import check_calibration, check_stats, prepare_images, resolve_calibration
 from .model import PI05Pytorch
 from .model.flow import FlowDraw, draw_flow
@@ -37,6 +38,7 @@ from .prompt import SMALL_TOKENIZER, small_number_ids
 
 logger = logging.getLogger(__name__)
 
+GATE = ".geometry_gate."  # in the name of the gate's parameter
 _EVALUATION_STEP = -1  # evaluation loss draws the same noise at every training step, so that its curve is comparable
 
 
@@ -88,17 +90,23 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if config.geometry_source == "da3":
             return self._build_da3(encoder)
         sizes = config.depth_cameras()
+        if config.geometry_pending and sizes:
+            self._accept_cameras(list(sizes))
+        pending = tuple(config.geometry_cameras or (f"camera{i}" for i in range(config.geometry_pending)))
         if config.geometry_source == "random":
-            cameras = tuple(sizes) or tuple(key.rsplit(".", 1)[-1] for key in config.image_features)
+            cameras = tuple(sizes) or pending or tuple(key.rsplit(".", 1)[-1] for key in config.image_features)
             if not cameras:
                 raise ValueError(
                     "geometry_source=random makes tokens per camera, but the data has none; use geometry_source=none."
                 )
             return RandomSource(cameras, config.geometry_grid)
+        if not sizes and config.geometry_pending and dataset_meta is None:
+            return UnknownCameras(pending, config.geometry_grid)
         if not sizes:
             raise ValueError(
                 "geometry_source=rgbd needs depth, but the data has no observation.images.<camera>_depth; record depth "
-                "(LeRobot: use_depth=true on the camera), or train with --policy.geometry_source=none."
+                "(LeRobot: use_depth=true on the camera), or train with --policy.geometry_source=none (for a converted "
+                "checkpoint: convert it with --geometry-source none)."
             )
         config.calibration = resolve_calibration(config, dataset_meta)
         config.calibration_given = config.calibration_given or config.calibration_path is not None
@@ -128,6 +136,17 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             config.da3_image_size,
             optional={camera for camera, key in keys.items() if config.may_be_absent(key)},
         )
+
+    def _accept_cameras(self, cameras: list[str]) -> None:
+        """The data has named the depth cameras of a converted checkpoint. Raises ValueError if they are not as many."""
+        if len(cameras) != self.config.geometry_pending:
+            names = ",".join(cameras)
+            raise ValueError(
+                f"The checkpoint was converted for {self.config.geometry_pending} depth camera(s), but the data has depth "
+                f"from {len(cameras)}: {names}; convert again with --geometry-cameras {names}, or choose among them with "
+                "--policy.geometry_cameras."
+            )
+        self.config.geometry_pending = 0
 
     def _set_trainable(self) -> None:
         network = self.model.paligemma_with_expert
@@ -242,19 +261,20 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def new_parameters(self) -> dict[str, nn.Parameter]:
         """What π0.5 does not have: the adapter with its embeddings, and the gate."""
         named = dict(self.named_parameters())
-        return {k: p for k, p in named.items() if k.startswith("geometry.") or ".geometry_gate." in k}
+        return {k: p for k, p in named.items() if k.startswith("geometry.") or GATE in k}
 
     def get_optim_params(self) -> list[dict[str, Any]]:
-        """Two parameter groups: π0.5's, and the new parameters with their own rate, eps and no weight decay."""
-        new = [p for p in self.new_parameters().values() if p.requires_grad]
-        ids = {id(p) for p in new}
+        """Parameter groups: π0.5's, and the new parameters with rates of their own, their eps and no weight decay."""
+        new = {name: p for name, p in self.new_parameters().items() if p.requires_grad}
+        ids = {id(p) for p in new.values()}
         groups: list[dict[str, Any]] = [
             {"params": [p for p in self.parameters() if p.requires_grad and id(p) not in ids]}
         ]
-        if new:
-            groups.append(
-                {"params": new, "lr": self.config.geometry_lr, "eps": self.config.geometry_eps, "weight_decay": 0.0}
-            )
+        gate = [p for name, p in new.items() if GATE in name]
+        rest = [p for name, p in new.items() if GATE not in name]
+        for params, lr in ((rest, self.config.geometry_lr), (gate, self.config.geometry_gate_lr)):
+            if params:
+                groups.append({"params": params, "lr": lr, "eps": self.config.geometry_eps, "weight_decay": 0.0})
         return groups
 
     @torch.no_grad()

@@ -22,7 +22,7 @@ class GeometrySegmentConfig:
     positions: "sequential" counts P|G|S; "parallel" gives the suffix the positions it would have without geometry.
     placement: "segment" between prefix and suffix, or "prefix" inside the VLM's own prefix (for comparison).
     expert: "shared" uses the action expert's weights, "own" a second expert that starts as its copy.
-    gate_init: log-gate that the suffix's attention logits on geometry start with; 0 is open, -8 almost closed.
+    gate_init: log-gate that the suffix's attention logits on geometry start with; 0 is open, -16 closed.
     """
 
     time: GeometryTime = "clean"

@@ -2,7 +2,7 @@
 
 New tokens take softmax mass from the pretrained ones, so geometry enters through a learned log-gate per layer and
 head, added to the suffix's attention logits on geometry keys: exp(gate) multiplies their softmax weight. 0 is open;
--8 leaves a token 0.03 % of its weight, so that a warm-started policy begins as the one it came from.
+-16 leaves a token 1e-7 of its weight, so that a warm-started policy begins as the one it came from.
 """
 
 import torch

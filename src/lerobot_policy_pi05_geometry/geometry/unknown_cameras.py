@@ -1,0 +1,44 @@
+"""Depth cameras that no data has named yet: what a converted checkpoint has until it is trained."""
+
+import logging
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from .keys import batch_like
+from .rgbd import FEATURE_DIM
+from .source import GeometryFeatures, GeometrySource
+
+logger = logging.getLogger(__name__)
+
+
+class UnknownCameras(GeometrySource):
+    """Places of `RgbdSource` tokens, all of them masked: the policy acts as the π0.5 that it came from."""
+
+    def __init__(self, cameras: tuple[str, ...], grid: int) -> None:
+        super().__init__()
+        self.cameras, self.grid, self.feature_dim = cameras, grid, FEATURE_DIM
+        self._said = False
+
+    def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
+        return []
+
+    def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
+        if self.training:
+            raise ValueError(
+                "A converted checkpoint learns its depth cameras from a dataset: build it with LeRobot's make_policy and "
+                "the dataset's metadata, as lerobot-train does."
+            )
+        if not self._said:
+            self._said = True
+            logger.warning(
+                "No data has named this checkpoint's depth cameras yet, so it acts without geometry, as the π0.5 it was "
+                "converted from; train it with lerobot-train --policy.path on data with depth."
+            )
+        like = batch_like(batch)
+        shape = (like.shape[0], len(self.cameras), self.grid**2)
+        return GeometryFeatures(
+            torch.zeros(*shape, self.feature_dim, device=like.device),
+            torch.zeros(shape, dtype=torch.bool, device=like.device),
+        )
