@@ -6,6 +6,7 @@
 All three run the same weights and inputs in one process, in turn, round by round; a ratio is the median over rounds of
 ours / LeRobot's in the same round. Peak memory is that of a process that builds one of them and predicts one chunk.
 Ours pads prompts to what the batch needs (`--prompt` tokens), LeRobot's always to 200: `--prompt 200` takes that apart.
+"chunk" is the plain path, "fast chunk" the runner, which policies use by default; LeRobot's is the same in both columns.
 "geometry" is what the segment adds to the prefix: prefix and geometry together, minus prefix, of the same round.
 """
 
@@ -25,10 +26,11 @@ from torch import Tensor
 from benchmarks.lerobot_pi05 import build_lerobot_pi05, copy_weights
 from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, NetworkConfig, PI05Pytorch
 from lerobot_policy_pi05_geometry.model.precision import Float32Module, compute_in
+from lerobot_policy_pi05_geometry.model.runner import ChunkRunner
 from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 
 ARMS = ("geometry", "no geometry", "lerobot")
-PARTS = ("prefix", "geometry", "denoise step", "chunk")
+PARTS = ("prefix", "geometry", "denoise step", "chunk", "fast chunk")
 
 
 @contextmanager
@@ -109,8 +111,9 @@ def parts(arm: str, network, args: argparse.Namespace) -> dict[str, Callable[[],
             "prefix": prefix,
             "denoise step": lambda: network.denoise_step(pad, cache, noise, now),
             "chunk": lambda: network.sample_actions(*observation, noise=noise),
+            "fast chunk": lambda: network.sample_actions(*observation, noise=noise),
         }
-    tokens = None
+    tokens, runner = None, ChunkRunner(network)
     if arm == "geometry":
         tokens = torch.randn(
             1, args.geometry_tokens, network.geometry_width, generator=torch.Generator().manual_seed(2)
@@ -126,6 +129,7 @@ def parts(arm: str, network, args: argparse.Namespace) -> dict[str, Callable[[],
         "prefix": context,
         "denoise step": lambda: network.denoise_step(before.pad, cache, noise, now, geometry),
         "chunk": lambda: network.sample_actions(*observation, noise=noise, geom_embs=tokens),
+        "fast chunk": lambda: runner(*observation, noise=noise, geom_embs=tokens),
     }
 
 
@@ -140,9 +144,9 @@ def times(args: argparse.Namespace) -> dict[str, dict[str, list[float]]]:
         for part in functions["lerobot"]:
             for arm in ARMS:
                 start = time.perf_counter()
-                for _ in range(args.repeat if part != "chunk" else 1):
+                for _ in range(args.repeat if "chunk" not in part else 1):
                     functions[arm][part]()
-                seconds = (time.perf_counter() - start) / (args.repeat if part != "chunk" else 1)
+                seconds = (time.perf_counter() - start) / (args.repeat if "chunk" not in part else 1)
                 if round_index:  # the first round warms up
                     result[arm][part].append(seconds)
     both, alone = result["geometry"]["prefix"], result["no geometry"]["prefix"]
@@ -155,7 +159,7 @@ def times(args: argparse.Namespace) -> dict[str, dict[str, list[float]]]:
 def peak_memory(arm: str, args: argparse.Namespace) -> float:
     """GiB that this process needs above what it held before, for building one arm and one chunk."""
     before = high_water_mark()
-    parts(arm, build(arm, args), args)["chunk"]()
+    parts(arm, build(arm, args), args)["fast chunk"]()
     return high_water_mark() - before
 
 

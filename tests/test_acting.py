@@ -105,7 +105,7 @@ def make_rtc_policy(enabled: bool = True) -> PI05GeometryPolicy:
 
 def test_guided_chunks_follow_what_is_left_of_the_previous_one():
     policy, batch, noise = make_rtc_policy(), make_batch(1), torch.randn(1, CHUNK, 8)
-    plain = make_policy().predict_action_chunk(batch, noise=noise)
+    plain = make_policy().predict_action_chunk(batch, noise=noise, runner="plain")
     unguided = policy.predict_action_chunk(batch, noise=noise)
     assert torch.equal(unguided, plain)  # nothing is left over yet
     left_over = plain + 1.0

@@ -35,6 +35,7 @@ _CHOICES = {
     "dtype": tuple(DTYPES),
     "param_dtype": tuple(DTYPES),
     "depth_unit": tuple(METRES_PER_UNIT),
+    "inference_runner": ("fast", "plain"),
     "geometry_source": ("none", "rgbd", "da3", "random"),
     "da3_dtype": tuple(DTYPES),
     "geometry_frame": ("base", "camera"),
@@ -96,6 +97,7 @@ class PI05GeometryConfig(PreTrainedConfig):
     tokenizer_max_length: int = 200
 
     num_inference_steps: int = 10
+    inference_runner: str = "fast"  # fast (model/runner.py), or plain: the reference that it must equal
     flow_samples: int = (
         1  # noises and flow times per training sample; they share one pass over prefix and (clean) geometry
     )

@@ -34,6 +34,7 @@ from .geometry.unknown_cameras import UnknownCameras
 from .inputs import check_calibration, check_stats, prepare_images, resolve_calibration
 from .model import PI05Pytorch
 from .model.flow import FlowDraw, draw_flow
+from .model.sampler import ChunkSampler
 from .prompt import SMALL_TOKENIZER, small_number_ids
 
 logger = logging.getLogger(__name__)
@@ -67,6 +68,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self.config: PI05GeometryConfig = config
         self.init_rtc_processor()
         self.model = PI05Pytorch(config.network(), self.rtc_processor)
+        self.sampler = ChunkSampler(self.model)
         source = self._build_source(dataset_meta, encoder)
         self.geometry = None if source is None else GeometryEncoder(source, self.model.geometry_width)
         if config.tokenizer == SMALL_TOKENIZER and not self.model.action_in_proj.weight.is_meta:
@@ -314,20 +316,20 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """An action chunk (B, chunk_size, action_dim), normalised.
 
-        kwargs: `noise` (B, S, max_action_dim), `num_steps`, and real-time chunking's `inference_delay`,
-        `prev_chunk_left_over` and `execution_horizon`.
+        kwargs: `noise` (B, S, max_action_dim), `num_steps`, `runner` ("fast" or "plain" instead of the configured one), and
+        real-time chunking's `inference_delay`, `prev_chunk_left_over` and `execution_horizon`.
         """
         self.eval()
         images, img_masks = prepare_images(batch, self.config, self.training_step.device)
         embs, pad = self._geometry_tokens(batch)
-        actions = self.model.sample_actions(
+        actions = self.sampler(
             images,
             img_masks,
             batch[OBS_LANGUAGE_TOKENS],
             batch[OBS_LANGUAGE_ATTENTION_MASK],
             geom_embs=embs,
             geom_pad=pad,
-            **kwargs,
+            **{"runner": self.config.inference_runner, **kwargs},
         )
         return actions[..., : self.config.action_feature.shape[0]]
 

@@ -48,7 +48,7 @@ def suffix_attention(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) ->
         for index, layer in enumerate(network.expert.layers)
     ]
     try:
-        policy.predict_action_chunk(dict(batch))
+        policy.predict_action_chunk(dict(batch), runner="plain")  # the runner has no modules to hook
     finally:
         for handle in handles:
             handle.remove()
@@ -81,7 +81,7 @@ def attention_layout(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) ->
 
     handle = network.register_forward_pre_hook(record, with_kwargs=True)
     try:
-        policy.predict_action_chunk(dict(batch), use_cache=False, num_steps=1)
+        policy.predict_action_chunk(dict(batch), runner="plain", use_cache=False, num_steps=1)
     finally:
         handle.remove()
     total = rows[-1].shape[1]

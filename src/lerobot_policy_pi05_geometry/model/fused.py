@@ -1,0 +1,105 @@
+"""Weights of one segment's layers in the form that the runner wants: fewer and larger matrices, in the compute dtype.
+
+```
+   q_proj | k_proj | v_proj  ─►  one matrix          gate_proj | up_proj  ─►  one matrix
+```
+
+Where a weight is stored in the compute dtype already, the network's own parameters become views of the large matrix: nothing
+is held twice, and what changes the one in place changes the other. Otherwise (bf16 compute over float32 storage) the large
+matrices are copies; `Weights.stale` tells when the network has moved on.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from .gemma import GemmaLayer, GemmaModel, RMSNorm
+
+
+@dataclass(frozen=True)
+class FusedLayer:
+    """One layer's matrices, (out, in) in the compute dtype, and the plain norms' scales, (W,) float32 or None."""
+
+    qkv: Tensor
+    out: Tensor
+    gate_up: Tensor
+    down: Tensor
+    norm: Tensor | None
+    post_norm: Tensor | None
+
+
+def fuse(model: GemmaModel, dtype: torch.dtype) -> list[FusedLayer]:
+    """All layers of a segment's transformer. Raises TypeError for a projection that is not a plain linear layer."""
+    return [_fuse_layer(layer, dtype) for layer in model.layers]
+
+
+def _fuse_layer(layer: GemmaLayer, dtype: torch.dtype) -> FusedLayer:
+    attention, mlp = layer.self_attn, layer.mlp
+    return FusedLayer(
+        qkv=_join([attention.q_proj, attention.k_proj, attention.v_proj], dtype),
+        out=_join([attention.o_proj], dtype),
+        gate_up=_join([mlp.gate_proj, mlp.up_proj], dtype),
+        down=_join([mlp.down_proj], dtype),
+        norm=norm_scale(layer.input_layernorm),
+        post_norm=norm_scale(layer.post_attention_layernorm),
+    )
+
+
+def norm_scale(norm: nn.Module) -> Tensor | None:
+    """1 + weight of a plain norm; None for an adaptive one, whose scale follows the flow time."""
+    return 1.0 + norm.weight.detach().float() if isinstance(norm, RMSNorm) else None
+
+
+def _join(linears: list[nn.Linear], dtype: torch.dtype) -> Tensor:
+    for linear in linears:
+        if type(linear) is not nn.Linear or linear.bias is not None:
+            raise TypeError(f"a projection is a {type(linear).__name__}, not a plain linear layer")
+    weights = [linear.weight for linear in linears]
+    if weights[0].dtype != dtype:
+        return torch.cat([weight.detach().to(dtype) for weight in weights])
+    if len(weights) == 1:
+        return weights[0].detach()
+    whole = _already_joined(weights)
+    if whole is None:
+        whole = torch.cat([weight.detach() for weight in weights])
+        start = 0
+        for weight in weights:  # one at a time, so that no more than one matrix is held twice
+            weight.data = whole[start : start + weight.shape[0]]
+            start += weight.shape[0]
+    return whole
+
+
+def _already_joined(weights: list[nn.Parameter]) -> Tensor | None:
+    """The large matrix that these weights are the rows of, if they stand one after the other in memory."""
+    place = weights[0].data_ptr()
+    for weight in weights:
+        if weight.data_ptr() != place or not weight.is_contiguous():
+            return None
+        place += weight.numel() * weight.element_size()
+    first, rows = weights[0].detach(), sum(weight.shape[0] for weight in weights)
+    if first.untyped_storage().nbytes() < (first.storage_offset() + rows * first.shape[1]) * first.element_size():
+        return None  # neighbours by chance, in storages of their own
+    return first.as_strided((rows, first.shape[1]), (first.shape[1], 1))
+
+
+class Weights:
+    """Remembers a network's modules and parameters, to notice when any was written to, replaced or moved."""
+
+    def __init__(self, network: nn.Module) -> None:
+        modules = list(network.modules())
+        self._members = [entries for module in modules for entries in (module._modules, module._parameters) if entries]
+        self._parameters = list(network.parameters())
+        self._seen = self._look()
+
+    def _look(self) -> tuple[int, int, int]:
+        members = (id(member) for entries in self._members for member in entries.values())
+        return (
+            hash(tuple(members)),
+            hash(tuple(parameter.data_ptr() for parameter in self._parameters)),
+            sum(parameter._version for parameter in self._parameters),
+        )
+
+    def stale(self) -> bool:
+        """Whether the network is another than it was."""
+        return self._look() != self._seen

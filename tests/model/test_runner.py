@@ -1,0 +1,250 @@
+"""Invariant 8: the runner equals the plain path, for any observation, and never acts on weights that are no longer there."""
+
+import copy
+import gc
+import logging
+
+import pytest
+import torch
+from hypothesis import given, settings
+from torch import Tensor, nn
+
+from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, PI05Pytorch
+from lerobot_policy_pi05_geometry.model.runner import ChunkRunner
+from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
+from tests.model.helpers import (
+    EVERY_GEOMETRY,
+    IN_PREFIX,
+    OWN_EXPERT,
+    PARALLEL,
+    SEGMENT,
+    Batch,
+    Case,
+    build_network,
+    cases,
+    name_of,
+    randomise,
+    sample,
+)
+
+CLEAN = [None, *(geometry for geometry in EVERY_GEOMETRY if geometry.time == "clean")]
+DENOISE = next(geometry for geometry in EVERY_GEOMETRY if geometry.time == "denoise")
+RUNNERS: dict[str, ChunkRunner] = {}
+
+
+def fast(run: ChunkRunner | ChunkSampler, batch: Batch, num_steps: int = 3, **kwargs) -> Tensor:
+    return run(
+        *batch.observation,
+        noise=batch.noise,
+        num_steps=num_steps,
+        geom_embs=batch.geom_embs,
+        geom_pad=batch.geom_pad,
+        **kwargs,
+    )
+
+
+def draw(network: PI05Pytorch, case: Case) -> Batch:
+    batch = case.draw(network.geometry_width)
+    return batch.without_geometry if network.config.geometry is None else batch
+
+
+def runner_of(geometry: GeometrySegmentConfig | None) -> ChunkRunner:
+    """One runner per configuration, kept over examples: what one observation leaves behind must not reach the next."""
+    if name_of(geometry) not in RUNNERS:
+        RUNNERS[name_of(geometry)] = ChunkRunner(build_network(geometry, seed=31).eval())
+    return RUNNERS[name_of(geometry)]
+
+
+@pytest.mark.parametrize("geometry", CLEAN, ids=name_of)
+@given(case=cases)
+@settings(max_examples=6)
+def test_the_runner_equals_the_plain_path(geometry: GeometrySegmentConfig | None, case: Case) -> None:
+    runner = runner_of(geometry)
+    batch = draw(runner.network, case)
+    expected, found = sample(runner.network, batch, num_steps=3), fast(runner, batch)
+    assert (expected - found).abs().max() <= 1e-6 * max(1.0, expected.abs().max())
+
+
+@pytest.mark.parametrize("geometry", [None, SEGMENT, IN_PREFIX], ids=name_of)
+def test_without_geometry_tokens_it_is_the_network_without_geometry(geometry: GeometrySegmentConfig | None) -> None:
+    runner = runner_of(geometry)
+    batch = Case(seed=3, batch=2).draw(runner.network.geometry_width).without_geometry
+    assert (sample(runner.network, batch, num_steps=3) - fast(runner, batch)).abs().max() < 2e-6
+
+
+@pytest.mark.parametrize("num_steps", [1, 4, 10])
+def test_any_number_of_steps(num_steps: int) -> None:
+    runner = runner_of(SEGMENT)
+    batch = draw(runner.network, Case(seed=4, batch=2))
+    expected = sample(runner.network, batch, num_steps=num_steps)
+    assert (expected - fast(runner, batch, num_steps)).abs().max() < 2e-6
+
+
+def test_the_same_observation_gives_the_same_bits_whatever_came_between() -> None:
+    runner = runner_of(PARALLEL)
+    first, second = (draw(runner.network, Case(seed=seed, batch=size)) for seed, size in ((5, 2), (6, 3)))
+    before = fast(runner, first)
+    fast(runner, second)
+    assert torch.equal(fast(runner, first), before)
+
+
+@pytest.mark.parametrize("param_dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("geometry", [SEGMENT, None], ids=name_of)
+def test_in_bf16_it_is_as_near_to_float32_as_the_plain_path_is(
+    geometry: GeometrySegmentConfig | None, param_dtype: torch.dtype
+) -> None:
+    """bf16 rounds both, differently: neither is the truth. The runner may be at most 1.5 times as far from float32."""
+    exact = build_network(geometry, seed=41).eval()
+    rounded = build_network(geometry, seed=41, dtype=torch.bfloat16, param_dtype=param_dtype).eval()
+    runner = ChunkRunner(rounded)
+    far = {"plain": 0.0, "fast": 0.0}
+    for seed in range(6):
+        batch = draw(exact, Case(seed=seed, batch=2))
+        truth = sample(exact, batch, num_steps=3)
+        far["plain"] += (sample(rounded, batch, num_steps=3) - truth).square().mean().item()
+        far["fast"] += (fast(runner, batch) - truth).square().mean().item()
+    assert 0 < far["fast"] < 1.5**2 * far["plain"]
+
+
+# --- weights ------------------------------------------------------------------------------------------------------
+
+
+def storage_bytes(network: nn.Module) -> int:
+    storages = {p.untyped_storage().data_ptr(): p.untyped_storage().nbytes() for p in network.parameters()}
+    return sum(storages.values())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_joined_matrices_are_the_networks_own_storage(dtype: torch.dtype) -> None:
+    network = build_network(OWN_EXPERT, dtype=dtype, param_dtype=dtype).eval()
+    before, weights = storage_bytes(network), copy.deepcopy(network.state_dict())
+    runner = ChunkRunner(network)
+    assert storage_bytes(network) == before
+    joined = {
+        m.untyped_storage().data_ptr() for layers in runner._layers.values() for w in layers for m in (w.qkv, w.gate_up)
+    }
+    assert joined <= {p.untyped_storage().data_ptr() for p in network.parameters()}
+    for name, tensor in network.state_dict().items():
+        assert torch.equal(tensor, weights[name]), name
+    again = ChunkRunner(network)  # finds them joined already
+    assert again._layers[0][0].qkv.data_ptr() == runner._layers[0][0].qkv.data_ptr()
+
+
+def step_of_training(network: PI05Pytorch) -> None:
+    for parameter in network.parameters():
+        parameter.grad = torch.randn_like(parameter)
+    torch.optim.SGD(network.parameters(), lr=0.05).step()
+
+
+def another_checkpoint(network: PI05Pytorch) -> None:
+    other = build_network(network.config.geometry, seed=77)
+    network.load_state_dict(other.state_dict())
+
+
+def new_tensors(network: PI05Pytorch) -> None:
+    for parameter in network.parameters():
+        parameter.data = parameter.data * 0.9
+
+
+def new_parameters(network: PI05Pytorch) -> None:
+    for module in network.modules():
+        for name, parameter in list(module._parameters.items()):
+            if parameter is not None:
+                setattr(module, name, nn.Parameter(parameter.detach() * 0.9))
+
+
+def new_modules(network: PI05Pytorch) -> None:
+    for layer in network.paligemma_with_expert.expert.layers:
+        fresh = nn.Linear(layer.mlp.up_proj.in_features, layer.mlp.up_proj.out_features, bias=False)
+        layer.mlp.up_proj = fresh
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize(
+    "change", [step_of_training, another_checkpoint, new_tensors, new_parameters, new_modules], ids=lambda f: f.__name__
+)
+def test_weights_that_changed_after_building_act(change, dtype: torch.dtype) -> None:
+    """Joined in place (float32) or copied (bf16 over float32), stale matrices and modulations never act."""
+    network = build_network(SEGMENT, seed=51, dtype=dtype).eval()
+    runner = ChunkRunner(network)
+    batch = draw(network, Case(seed=7, batch=2))
+    before = fast(runner, batch)
+    change(network)
+    after = fast(runner, batch)
+    assert not torch.allclose(before, after, atol=1e-3)
+    fresh = ChunkRunner(copy.deepcopy(network))
+    assert torch.allclose(after, fast(fresh, batch), atol=1e-6)
+
+
+def test_a_network_that_has_run_still_trains() -> None:
+    """Gradients of joined weights are those of single ones."""
+    joined, single = (build_network(SEGMENT, seed=61) for _ in range(2))
+    batch = draw(joined, Case(seed=8, batch=2))
+    fast(ChunkRunner(joined), batch)
+    for network in (joined, single):
+        network(*batch).mean().backward()
+    for (name, a), (_, b) in zip(joined.named_parameters(), single.named_parameters(), strict=True):
+        assert (a.grad is None) == (b.grad is None), name
+        assert a.grad is None or torch.equal(a.grad, b.grad), name
+
+
+def test_many_chunks_leave_nothing_behind() -> None:
+    runner = runner_of(SEGMENT)
+    batches = [draw(runner.network, Case(seed=seed, batch=1)) for seed in range(4)]
+
+    def tensors_after(chunks: int) -> int:
+        for i in range(chunks):
+            fast(runner, batches[i % 4], num_steps=2)
+        gc.collect()
+        return sum(isinstance(thing, Tensor) for thing in gc.get_objects())
+
+    assert tensors_after(8) == tensors_after(40)
+
+
+# --- choosing -----------------------------------------------------------------------------------------------------
+
+
+class Adapted(nn.Linear):
+    """Stands for a projection that something has wrapped, as PEFT does."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return 2 * super().forward(x)
+
+
+def test_a_wrapped_projection_is_served_by_the_plain_path(caplog) -> None:
+    network = build_network(SEGMENT, seed=71).eval()
+    sampler = ChunkSampler(network)
+    batch = draw(network, Case(seed=9, batch=2))
+    assert sampler.explain()["runner"] == "active"
+    before = fast(sampler, batch)
+    mlp = network.paligemma_with_expert.expert.layers[0].mlp
+    wrapped = Adapted(mlp.up_proj.in_features, mlp.up_proj.out_features, bias=False)
+    wrapped.weight = mlp.up_proj.weight
+    mlp.up_proj = wrapped
+    with caplog.at_level(logging.WARNING):
+        after = [fast(sampler, batch) for _ in range(2)]
+    assert torch.equal(after[0], sample(network, batch, num_steps=3))
+    assert torch.equal(after[0], after[1])
+    assert not torch.allclose(before, after[0], atol=1e-3)
+    assert [r.getMessage() for r in caplog.records] == [
+        "The plain path computes the actions, since a projection is a Adapted, not a plain linear layer."
+    ]
+    assert "declined: a projection is a Adapted" in sampler.explain()["runner"]
+
+
+def test_what_the_runner_does_not_do_is_done_by_the_plain_path() -> None:
+    follows_time = build_network(DENOISE, seed=81).eval()
+    batch = draw(follows_time, Case(seed=10, batch=2))
+    assert torch.equal(fast(ChunkSampler(follows_time), batch), sample(follows_time, batch, num_steps=3))
+    network = build_network(SEGMENT, seed=82).eval()
+    plain = fast(ChunkSampler(network), batch, use_cache=False)
+    assert torch.equal(plain, sample(network, batch, num_steps=3, use_cache=False))
+    assert torch.equal(fast(ChunkSampler(network), batch, runner="plain"), sample(network, batch, num_steps=3))
+
+
+def test_a_runner_of_another_seed_is_another_policy() -> None:
+    """The comparisons above can fail."""
+    batch = draw(runner_of(SEGMENT).network, Case(seed=11, batch=2))
+    other = build_network(SEGMENT, seed=32).eval()
+    randomise(other, 5)
+    assert (fast(runner_of(SEGMENT), batch) - fast(ChunkRunner(other), batch)).abs().max() > 1e-2
