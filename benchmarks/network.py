@@ -18,7 +18,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -43,26 +44,50 @@ def default_dtype(dtype: torch.dtype) -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
+@contextmanager
+def uninitialised() -> Iterator[None]:
+    """Build modules without drawing their weights, which takes minutes at the released size; `fill` sets them."""
+    names = [name for name in dir(torch.nn.init) if name.endswith("_") and not name.startswith("_")]
+    with ExitStack() as stack:
+        for name in names:
+            stack.enter_context(patch.object(torch.nn.init, name, lambda tensor, *_, **__: tensor))
+        yield
+
+
+@torch.no_grad()
+def fill(network: torch.nn.Module) -> None:
+    """Random weights, quickly: large tensors repeat a random block."""
+    block = 0.02 * torch.randn(1 << 20, generator=torch.Generator().manual_seed(0))
+    for parameter in network.parameters():
+        flat = parameter.view(-1)
+        for start in range(0, len(flat), len(block)):
+            flat[start : start + len(block)] = block[: len(flat) - start]
+
+
 def build(arm: str, args: argparse.Namespace, weights: torch.nn.Module | None = None):
     """One arm's network; `weights` is LeRobot's, to copy from."""
     vlm, expert = ("gemma_2b", "gemma_300m") if args.full else ("small", "small")
     size, dtype = (224, torch.bfloat16) if args.full else (84, torch.float32)
-    torch.manual_seed(0)
     if arm == "lerobot":
-        with default_dtype(dtype):
-            return build_lerobot_pi05(
+        with default_dtype(dtype), uninitialised():
+            network = build_lerobot_pi05(
                 vlm, expert, image_size=size, chunk_size=args.chunk, max_action_dim=32,
                 dtype="bfloat16" if args.full else "float32",
-            ).eval()  # fmt: skip
+            )  # fmt: skip
+        for module in (network.action_in_proj, network.action_out_proj, network.time_mlp_in, network.time_mlp_out):
+            module.float()  # as LeRobot has them; they were built in the default dtype
+        fill(network)
+        return network.eval()
     config = NetworkConfig(
         PALIGEMMA_VARIANTS[vlm], EXPERT_VARIANTS[expert], size, args.chunk, 32, dtype=dtype, param_dtype=dtype,
         geometry=GeometrySegmentConfig(),
     )  # fmt: skip
-    with default_dtype(dtype):
+    with default_dtype(dtype), uninitialised():
         network = PI05Pytorch(config)
     for module in network.modules():  # what is stored in float32 was built in the default dtype
         if isinstance(module, Float32Module | torch.nn.LayerNorm):
             module.float()
+    fill(network)
     if weights is not None:
         copy_weights(weights, network)
     return network.eval()

@@ -69,7 +69,7 @@ def test_good_statistics_pass_without_a_word(caplog):
 @pytest.mark.parametrize("key", [STATE, "action"])
 @pytest.mark.parametrize("name", ["q01", "q99"])
 def test_missing_quantiles_are_named(key, name):
-    with pytest.raises(ValueError, match=rf"no q01/q99 statistics for {key}.*augment_dataset_quantile_stats"):
+    with pytest.raises(ValueError, match=rf"no q01/q99 statistics for {key}.*pi05-geometry quantiles"):
         check(stats_with(key, **{name: None}))
 
 

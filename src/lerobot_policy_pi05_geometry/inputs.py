@@ -75,7 +75,7 @@ def check_stats(config: PI05GeometryConfig, stats: Mapping[str, Mapping[str, Any
         if low_name not in stats.get(key, {}) or high_name not in stats[key]:
             raise ValueError(
                 f"The dataset has no {low_name}/{high_name} statistics for {key}, which {mode.value} normalisation needs; "
-                "add them with LeRobot's augment_dataset_quantile_stats.py, or choose another --policy.normalization_mapping."
+                "add them with `pi05-geometry quantiles --dataset.root=...`, or choose another --policy.normalization_mapping."
             )
         low, high = (torch.as_tensor(stats[key][name]).flatten().double() for name in (low_name, high_name))
         for dim in (high <= low).nonzero().flatten().tolist():
