@@ -34,7 +34,8 @@ def fuse(model: GemmaModel, dtype: torch.dtype) -> list[FusedLayer]:
     return [_fuse_layer(layer, dtype) for layer in model.layers]
 
 
-def _fuse_layer(layer: GemmaLayer, dtype: torch.dtype) -> FusedLayer:
+def _fuse_layer(layer: nn.Module, dtype: torch.dtype) -> FusedLayer:
+    assert isinstance(layer, GemmaLayer)
     attention, mlp = layer.self_attn, layer.mlp
     return FusedLayer(
         qkv=_join([attention.q_proj, attention.k_proj, attention.v_proj], dtype),
@@ -70,7 +71,7 @@ def _join(linears: list[nn.Linear], dtype: torch.dtype) -> Tensor:
     return whole
 
 
-def _already_joined(weights: list[nn.Parameter]) -> Tensor | None:
+def _already_joined(weights: list[Tensor]) -> Tensor | None:
     """The large matrix that these weights are the rows of, if they stand one after the other in memory."""
     place = weights[0].data_ptr()
     for weight in weights:

@@ -18,13 +18,13 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from torch import Tensor
+from torch import Tensor, nn
 
 from .attention import rotary_table
 from .cache import SegmentKVCache
 from .fused import FusedLayer, Weights, fuse
 from .gemma import RMS_EPS, AdaRMSNorm, GemmaModel
-from .layout import Segment, segment_mask, segment_positions
+from .layout import Segment, one_block, segment_mask, segment_positions
 from .pi05 import PI05Pytorch, SegmentTokens
 from .precision import compute_in
 
@@ -91,7 +91,8 @@ class ChunkRunner:
         device = self.network.action_in_proj.weight.device
         cond = self.network.embed_time(torch.tensor([time], dtype=torch.float32, device=device))
 
-        def at(norm: AdaRMSNorm) -> Modulation:
+        def at(norm: nn.Module | Tensor) -> Modulation:
+            assert isinstance(norm, AdaRMSNorm)
             scale, shift, gate = norm.dense(cond)[0].chunk(3)
             return Modulation(1.0 + scale, shift, gate.to(self.config.dtype))
 
@@ -119,23 +120,49 @@ class ChunkRunner:
     ) -> Tensor:
         """An action chunk (B, S, D) float32; arguments as in `PI05Pytorch.sample_actions`."""
         self.refresh()
-        config, network = self.config, self.network
         if noise is None:
-            noise = torch.randn(tokens.shape[0], config.chunk_size, config.max_action_dim, device=tokens.device)
-        with compute_in(config.dtype, tokens.device):
-            prefix, geometry = network._context(images, img_masks, tokens, masks, geom_embs, geom_pad, None)
-        suffix_pad = torch.ones(noise.shape[:2], dtype=torch.bool, device=noise.device)
-        segments = [prefix, geometry, SegmentTokens(None, suffix_pad, [1] + [0] * (noise.shape[1] - 1))]
-        frames, cache = self._frames(segments)
-        assert prefix.embs is not None
-        self._run(Segment.PREFIX, prefix.embs.to(config.dtype), frames, cache, None, output=False)
-        if geometry is not None and geometry.embs is not None:
-            self._run(Segment.GEOMETRY, geometry.embs.to(config.dtype), frames, cache, self._clean, output=False)
-        return self._denoise(noise, num_steps or config.num_inference_steps, frames, cache)
+            shape = (tokens.shape[0], self.config.chunk_size, self.config.max_action_dim)
+            noise = torch.randn(shape, device=tokens.device)
+        segments, frames, cache = self.prepare(images, img_masks, tokens, masks, noise, geom_embs, geom_pad)
+        self.prefill(Segment.PREFIX, segments, frames, cache)
+        self.prefill(Segment.GEOMETRY, segments, frames, cache)
+        return self.denoise(noise, num_steps or self.config.num_inference_steps, frames, cache)
 
-    def _denoise(
+    def prepare(
+        self,
+        images: Sequence[Tensor | None],
+        img_masks: Sequence[Tensor],
+        tokens: Tensor,
+        masks: Tensor,
+        noise: Tensor,
+        geom_embs: Tensor | None,
+        geom_pad: Tensor | None,
+    ) -> tuple[list[SegmentTokens | None], dict[Segment, SegmentFrame], SegmentKVCache]:
+        """Vision and text; what is the same in every layer; an empty cache."""
+        with compute_in(self.config.dtype, tokens.device):
+            prefix, geometry = self.network._context(images, img_masks, tokens, masks, geom_embs, geom_pad, None)
+        pad = torch.ones(noise.shape[:2], dtype=torch.bool, device=noise.device)
+        segments = [prefix, geometry, SegmentTokens(None, pad, one_block(noise.shape[1]))]
+        return segments, *self._frames(segments)
+
+    def prefill(
+        self,
+        segment: Segment,
+        segments: Sequence[SegmentTokens | None],
+        frames: dict[Segment, SegmentFrame],
+        cache: SegmentKVCache,
+    ) -> None:
+        """Keys and values of prefix or geometry into the cache; nothing for a segment that is not there."""
+        given = segments[segment]
+        if given is None or given.embs is None:
+            return
+        modulations = self._clean if segment is Segment.GEOMETRY else None
+        self._run(segment, given.embs.to(self.config.dtype), frames, cache, modulations, output=False)
+
+    def denoise(
         self, x_t: Tensor, num_steps: int, frames: dict[Segment, SegmentFrame], cache: SegmentKVCache
     ) -> Tensor:
+        """Integrate the flow from noise x_t (B, S, D) over a filled cache."""
         network, dt = self.network, -1.0 / num_steps
         for layers, last in self._schedule(num_steps):
             embs = network.action_in_proj(x_t).to(self.config.dtype)
