@@ -345,6 +345,47 @@ def export(
     console.print(f"LeRobot's π0.5 loads it: --policy.path={output}")
 
 
+@app.command()
+def bench(
+    checkpoint: Annotated[str, typer.Argument(help="Checkpoint folder (pretrained_model) or hub id.")],
+    device: Annotated[str, typer.Option(help="Where the policy runs.")] = "cpu",
+    dataset_root: Annotated[
+        Path | None, typer.Option("--dataset.root", help="Take the observation from this dataset; else it is random.")
+    ] = None,
+    dataset_repo_id: Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")] = "local/dataset",
+    rounds: Annotated[int, typer.Option(help="Predictions to time.")] = 20,
+) -> None:
+    """How long a checkpoint takes for an action chunk on this machine, where the time goes, and what would change it."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from rich.table import Table
+
+    from .bench import bench as run
+    from .bench import random_observation
+    from .inspect.inspection import frame_batch
+    from .loading import load_policy
+
+    loaded = load_policy(checkpoint, device)
+    if dataset_root is None:
+        observation = random_observation(loaded.policy.config)
+    else:
+        unit = loaded.policy.config.depth_unit
+        observation = frame_batch(LeRobotDataset(dataset_repo_id, root=dataset_root, depth_output_unit=unit), 0)
+    result = run(loaded, observation, rounds)
+    table = Table("", "median ms", "95 % ms")
+    rows = {"action chunk": result.chunk, "by the plain path": result.plain} | {
+        f"  {name}": timing for name, timing in result.parts.items()
+    }
+    for name, timing in rows.items():
+        table.add_row(name, f"{timing.p50:.1f}", f"{timing.p95:.1f}")
+    console.print(table)
+    if result.peak_bytes is not None:
+        console.print(f"Peak memory: {result.peak_bytes / 2**30:.2f} GiB")
+    for name, state in result.explanation.items():
+        console.print(f"{name}: {state}", soft_wrap=True)
+    for sentence in result.advice:
+        console.print(f"→ {sentence}", soft_wrap=True)
+
+
 def main() -> None:
     """Entry point: errors of the user's input are one sentence, not a traceback."""
     logging.basicConfig(
