@@ -102,7 +102,7 @@ def _task(
     titles = [CONDITIONS[condition].title for condition in conditions]
     caption = "Success per arm and condition, over all training seeds."
     page.row(picture(success_figure(titles, bars), caption, pictures / f"success_{task}.png"))
-    parameters = {run.arm_name: _parameters(run) for run in runs if run.task == task and run.checkpoint.exists()}
+    parameters = {run.arm_name: _parameters(run) for run in _finished(runs) if run.task == task}
     page.table(
         ["arm", "what it is", "parameters", *titles],
         [
@@ -130,7 +130,7 @@ def _task(
 
 def _inside(page: Page, runs: Sequence[SimulatedRun], pictures: Path) -> None:
     """What a trained policy with geometry looks at, and how training went."""
-    trained = [run for run in runs if run.checkpoint.exists()]
+    trained = _finished(runs)
     first = next((run for run in trained if run.arm_name == "geometry"), None)
     page.heading("Inside")
     if first is not None:
@@ -157,6 +157,11 @@ def _inside(page: Page, runs: Sequence[SimulatedRun], pictures: Path) -> None:
     if same:
         curves = {run.arm_name: read_curve(run.log) for run in same}
         page.row(picture(curves_figure(curves), "Loss on training batches, first seed.", pictures / "curves.png"))
+
+
+def _finished(runs: Sequence[SimulatedRun]) -> list[SimulatedRun]:
+    """Runs that did not crash: those that did may have left anything."""
+    return [run for run in runs if not run.crash.exists()]
 
 
 def _bar(cell: Cell) -> tuple[float, float, float]:
