@@ -5,6 +5,8 @@ Training needs no encoder then; the checkpoint records which one the features ar
 
 from pathlib import Path
 
+from lerobot.configs.train import TrainPipelineConfig
+
 from .configuration_pi05_geometry import PI05GeometryConfig
 from .frozen import backbone_hash, find_encoder
 from .geometry.da3 import default_image_size
@@ -29,6 +31,23 @@ def open_store(config: PI05GeometryConfig, root: Path) -> FeatureStore:
     config.da3_encoder = config.da3_encoder or manifest.encoder
     config.da3_hash, config.da3_image_size = manifest.encoder_hash, manifest.image_size
     return store
+
+
+def refuse_augmentation(training: TrainPipelineConfig) -> None:
+    """Raise ValueError for training that changes images of which it has the features already.
+
+    Only commands that see LeRobot's whole configuration can ask; the policy cannot.
+    """
+    policy = training.policy
+    if (
+        isinstance(policy, PI05GeometryConfig)
+        and policy.geometry_source == "features"
+        and training.dataset.image_transforms.enable
+    ):
+        raise ValueError(
+            "geometry_source=features holds features of the images as they are, so they cannot be augmented: set "
+            "--dataset.image_transforms.enable=false, or train with --policy.geometry_source=da3."
+        )
 
 
 def misfit(config: PI05GeometryConfig, manifest: Manifest, root: Path) -> str | None:

@@ -79,7 +79,7 @@ def read_manifest(folder: Path) -> Manifest:
             f"{folder} is no feature store ({MANIFEST_FILE} is missing); make one with pi05-geometry precompute."
         )
     try:
-        content = json.loads(path.read_text())
+        content = dict(json.loads(path.read_text()))
         key = content.pop("key")
         if content.get("format") != FORMAT:
             raise ValueError(
@@ -88,7 +88,7 @@ def read_manifest(folder: Path) -> Manifest:
         if set(content) != {field.name for field in fields(Manifest)}:
             raise KeyError("other entries than expected")
         manifest = Manifest(**content)
-    except (json.JSONDecodeError, KeyError, AttributeError) as error:
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(
             f"{path} is damaged ({error}); delete it and run pi05-geometry precompute again, which keeps the finished files."
         ) from error
