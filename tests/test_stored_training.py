@@ -25,7 +25,11 @@ def command(*arguments: str, fails: bool = False, **environment: str) -> str:
     """Run a command of Python modules without a hub; returns what it wrote."""
     settings = {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
     result = subprocess.run(
-        [sys.executable, "-m", *arguments], env=os.environ | settings | environment, capture_output=True, text=True, timeout=500
+        [sys.executable, "-m", *arguments],
+        env=os.environ | settings | environment,
+        capture_output=True,
+        text=True,
+        timeout=500,
     )
     assert (result.returncode != 0) == fails, result.stdout[-2000:] + result.stderr[-3000:]
     return result.stdout + result.stderr

@@ -21,7 +21,12 @@ def root(tmp_path):
 def test_the_hash_is_of_the_tables_that_say_where_frames_are(root, tmp_path):
     before = dataset_hash(root)
     assert dataset_hash(shutil.copytree(root, tmp_path / "copy")) == before
-    for name in ("meta/stats.json", "meta/tasks.parquet", "data/chunk-000/file-000.parquet", "geometry/a/manifest.json"):
+    for name in (
+        "meta/stats.json",
+        "meta/tasks.parquet",
+        "data/chunk-000/file-000.parquet",
+        "geometry/a/manifest.json",
+    ):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text("changed")
         assert dataset_hash(root) == before, name
@@ -36,7 +41,10 @@ def test_the_hash_is_of_the_tables_that_say_where_frames_are(root, tmp_path):
 
 def test_a_file_of_frames_that_changed_is_named(root):
     recorded = frame_files(root)
-    assert list(recorded) == ["data/chunk-000/file-000.parquet", "videos/observation.images.front/chunk-000/file-000.mp4"]
+    assert list(recorded) == [
+        "data/chunk-000/file-000.parquet",
+        "videos/observation.images.front/chunk-000/file-000.mp4",
+    ]
     assert changed_file(root, recorded) is None
     (root / "data/chunk-000/file-000.parquet").unlink()  # a partial download
     assert changed_file(root, recorded) is None

@@ -78,7 +78,7 @@ class FeatureStore:
 
     def _check_size(self, shard: int) -> None:
         path, expected = self.manifest.shard_path(self.folder, shard), self.manifest.shard_bytes(shard)
-        found = path.stat().st_size
+        found = path.stat().st_size if path.is_file() else 0
         if found != expected:
             raise ValueError(f"Store file {path} is damaged: expected {expected} bytes, found {found}; {_MEND}.")
 
