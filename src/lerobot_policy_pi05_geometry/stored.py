@@ -28,6 +28,7 @@ def open_store(config: PI05GeometryConfig, root: Path) -> FeatureStore:
     if reason is not None:
         raise ValueError(f"The feature store {folder} does not fit: {reason}.")
     store = FeatureStore(folder)
+    store.read_ahead()
     config.da3_encoder = config.da3_encoder or manifest.encoder
     config.da3_hash, config.da3_image_size = manifest.encoder_hash, manifest.image_size
     return store

@@ -2,7 +2,10 @@
 
 import dataclasses
 import shutil
+from collections import namedtuple
+from pathlib import Path
 
+import psutil
 import pytest
 import torch
 from hypothesis import given
@@ -84,6 +87,22 @@ def test_the_key_is_of_what_features_depend_on():
     for name, value in other.items():
         assert dataclasses.replace(make_manifest(), **{name: value}).key != key, name
     assert {*same, *other, "format"} == {field.name for field in dataclasses.fields(Manifest)}
+
+
+def test_the_whole_store_is_read_ahead_if_memory_can_hold_it(tmp_path, monkeypatch):
+    def bytes_read() -> int:
+        return int(Path("/proc/self/io").read_text().split()[1])
+
+    manifest = make_manifest(frames=2500, shard_frames=1000, grid=6, width=16)
+    store = FeatureStore(write_store(tmp_path, manifest, batch=1000))
+    size, before = sum(manifest.shard_bytes(shard) for shard in range(3)), bytes_read()
+    store.read_ahead().join()
+    assert size <= bytes_read() - before < 1.1 * size
+    memory = namedtuple("memory", "available")
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory(2 * size))
+    assert store.read_ahead() is not None
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory(2 * size - 1))
+    assert store.read_ahead() is None
 
 
 # --- interrupted --------------------------------------------------------------------------------------------------

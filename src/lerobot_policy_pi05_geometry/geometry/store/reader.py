@@ -3,13 +3,17 @@
 import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from threading import Thread
 
+import psutil
 import torch
 from torch import Tensor
 
 from .manifest import Manifest, read_manifest
 from .shards import is_good, map_records
 
+_SHARE_OF_MEMORY = 0.5  # of what is available; a store larger than that would push itself out of the page cache again
+_BLOCK = 1 << 23  # bytes
 _MEND = "delete it and run pi05-geometry precompute again, which computes this file alone"
 
 
@@ -43,6 +47,28 @@ class FeatureStore:
         for row, index in zip(features.flatten(1), indices, strict=True):
             row.copy_(self._record(index)[: row.numel()])
         return features
+
+    def read_ahead(self) -> Thread | None:
+        """Read every file once, in the background, so that shuffled frames soon come from memory; None if they do not fit.
+
+        The policy learns too late which frames it gets to ask for them in advance, so all of them are asked for.
+        """
+        size = self.manifest.frames * self.manifest.record_bytes
+        if size > _SHARE_OF_MEMORY * psutil.virtual_memory().available:
+            return None
+        thread = Thread(target=self._read_all, name="feature store read-ahead", daemon=True)
+        thread.start()
+        return thread
+
+    def _read_all(self) -> None:
+        block = bytearray(_BLOCK)
+        for shard in range(self.manifest.shards):
+            try:
+                with self.manifest.shard_path(self.folder, shard).open("rb", buffering=0) as file:
+                    while file.readinto(block):
+                        pass
+            except OSError:  # whoever needs a frame of it is told
+                return
 
     def verify(self) -> Iterator[int]:
         """Compare every file with its SHA-256; yields the number of bytes after each. Raises ValueError at a damaged one."""
