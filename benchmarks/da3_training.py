@@ -241,9 +241,8 @@ def show(result: dict) -> None:
     print(f"{'':10}{'samples/s':>12}{'CPU s':>12}{'ms added':>12}{'peak MB':>12}{'MB added':>12}")
     for name, row in result["arms"].items():
         print(f"{name:10}" + "".join(f"{value:12.2f}" for value in row.values()))
-    print(
-        f"store / live: {result['store_over_live']:.1f} x; store / random tokens: {result['store_over_random']:.3f} x"
-    )
+    for name in ("store_over_live", "store_over_random"):
+        print(f"{name.replace('_', ' ')}: " + ", ".join(f"{value:.2f} x by {by}" for by, value in result[name].items()))
     print("reading a batch, ms: " + ", ".join(f"{name} {value:.2f}" for name, value in result["read_ms"].items()))
 
 
