@@ -266,6 +266,52 @@ def quantiles(
 
 
 @app.command()
+def precompute(
+    dataset_root: Annotated[
+        Path | None, typer.Option("--dataset.root", help="Folder of a LeRobotDataset; the hub's copy if left out.")
+    ] = None,
+    dataset_repo_id: Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")] = "local/dataset",
+    encoder: Annotated[
+        str, typer.Option(help="Depth Anything 3: hub id, folder or safetensors file.")
+    ] = "depth-anything/DA3-BASE",
+    grid: Annotated[int, typer.Option(help="Cells per side and camera: the policy's geometry_grid.")] = 8,
+    cameras: Annotated[
+        str | None, typer.Option(help="With commas, in token order; every RGB camera, sorted, if left out.")
+    ] = None,
+    image_size: Annotated[int | None, typer.Option(help="Pixels per side: the policy's da3_image_size.")] = None,
+    dtype: Annotated[str, typer.Option(help="What the encoder computes in: bfloat16 or float32.")] = "bfloat16",
+    batch_size: Annotated[int, typer.Option(help="Frames per pass of the encoder.")] = 16,
+    device: Annotated[str | None, typer.Option(help="Where the encoder runs; a GPU if there is one.")] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder for stores; the dataset's own if left out.")] = None,
+    shard_frames: Annotated[int, typer.Option(help="Frames per file.")] = 512,
+    check: Annotated[
+        bool, typer.Option("--verify", help="Read the finished store, and compare its checksums.")
+    ] = False,
+) -> None:
+    """Compute geometry from RGB once: Depth Anything 3's features of every frame, to train with geometry_source=features.
+
+    Killed and started again it goes on where it stopped. Several processes or machines that share the folder divide the work
+    when started with torchrun (`torchrun --nproc-per-node 4 --no-python pi05-geometry precompute ...`).
+    """
+    from .precompute.command import run_precompute
+
+    names = None if cameras is None else cameras.split(",")
+    with Progress(
+        TextColumn("{task.description:<28}"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    ) as bars:
+        run_precompute(
+            dataset_root, dataset_repo_id, encoder, grid, names, image_size, dtype, batch_size, device, output,
+            shard_frames, check, bars,
+        )  # fmt: skip
+
+
+@app.command()
 def inspect(
     checkpoint: Annotated[str, typer.Argument(help="Checkpoint folder (pretrained_model) or hub id.")],
     dataset_root: Annotated[Path, typer.Option("--dataset.root", help="Folder of a LeRobotDataset.")],

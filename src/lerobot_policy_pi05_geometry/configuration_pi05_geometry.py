@@ -28,6 +28,7 @@ from .prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
 logger = logging.getLogger(__name__)
 
 EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
+DEFAULT_ENCODER = "depth-anything/DA3-BASE"
 
 _CHOICES = {
     "paligemma_variant": tuple(PALIGEMMA_VARIANTS),
@@ -36,7 +37,7 @@ _CHOICES = {
     "param_dtype": tuple(DTYPES),
     "depth_unit": tuple(METRES_PER_UNIT),
     "inference_runner": ("fast", "plain"),
-    "geometry_source": ("none", "rgbd", "da3", "random"),
+    "geometry_source": ("none", "rgbd", "da3", "features", "random"),
     "da3_dtype": tuple(DTYPES),
     "geometry_frame": ("base", "camera"),
     "geometry_time": get_args(GeometryTime),
@@ -63,8 +64,11 @@ class PI05GeometryConfig(PreTrainedConfig):
     max_action_dim: int = 32
 
     # Geometry
-    geometry_source: str = "rgbd"  # none (plain π0.5), rgbd (depth cameras), da3 (RGB cameras), random (control)
-    geometry_cameras: list[str] | None = None  # names in token order; None: every camera that has depth, or RGB for da3
+    # none (plain π0.5), rgbd (depth cameras), da3 (RGB cameras), features (da3, computed in advance), random (control)
+    geometry_source: str = "rgbd"
+    geometry_cameras: list[str] | None = (
+        None  # names in token order; None: every camera that has depth, or RGB for da3 and features
+    )
     geometry_grid: int = 8  # cells per side and camera
     geometry_frame: str = "base"  # points in the robot's base frame, or in the camera's
     geometry_time: str = "clean"  # flow time that conditions geometry: clean (cached) or denoise (recomputed)
@@ -84,13 +88,14 @@ class PI05GeometryConfig(PreTrainedConfig):
     # Depth cameras that a converted checkpoint has embeddings for, before any data has named them; then 0.
     geometry_pending: int = 0
 
-    # Depth Anything 3, for geometry_source=da3 (docs/geometry-from-rgb.md)
-    da3_encoder: str = "depth-anything/DA3-BASE"  # hub id, folder or safetensors file
+    # Depth Anything 3, for geometry_source=da3 and features (docs/geometry-from-rgb.md)
+    da3_encoder: str | None = None  # hub id, folder or safetensors file; None: DA3-BASE, or the feature store's
     da3_hash: str | None = None  # SHA-256 of its backbone, recorded at first use and verified ever after
     da3_image_size: int | None = (
         None  # pixels per side, a multiple of 14 * geometry_grid; None: the smallest from 196 on
     )
     da3_dtype: str = "bfloat16"  # what it computes in; float32 for comparisons
+    features_path: str | None = None  # for geometry_source=features: the store's folder; None: the dataset's own
 
     # Tokenizer folder or hub id; None: PaliGemma's from the hub, or the built-in one for the small sizes.
     tokenizer_path: str | None = None
@@ -153,6 +158,8 @@ class PI05GeometryConfig(PreTrainedConfig):
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"--policy.{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
+        if self.geometry_source == "da3" and self.da3_encoder is None:
+            self.da3_encoder = DEFAULT_ENCODER
         self._check_numbers()
         self.network()  # names variants that do not belong together
 
@@ -292,6 +299,10 @@ class PI05GeometryConfig(PreTrainedConfig):
                 f"{', '.join(found) or 'no camera'} only."
             )
         return {camera: found[camera] for camera in self.geometry_cameras}
+
+    def optional_rgb_cameras(self) -> set[str]:
+        """Those of `rgb_cameras` that observations may lack."""
+        return {camera for camera, key in self.rgb_cameras().items() if self.may_be_absent(key)}
 
     @property
     def tokenizer(self) -> str:

@@ -29,13 +29,16 @@ def load_da3(config: PI05GeometryConfig) -> Da3Encoder:
     Not to be called where parameters are made on the meta device: its weights are real from the start.
     Raises FileNotFoundError or ValueError, with one sentence, for an encoder that cannot be had, is broken, or is another.
     """
-    path = _find(config.da3_encoder)
+    name = config.da3_encoder
+    if name is None:
+        raise ValueError("This policy names no Depth Anything 3 encoder; say which by --policy.da3_encoder.")
+    path = find_encoder(name)
     variant = read_variant(path)
-    _warn_of_licence(config.da3_encoder, variant)
+    _warn_of_licence(name, variant)
     found = backbone_hash(path)
     if config.da3_hash not in (None, found):
         raise ValueError(
-            f"This policy was trained with another encoder than {config.da3_encoder} holds: expected SHA-256 "
+            f"This policy was trained with another encoder than {name} holds: expected SHA-256 "
             f"{config.da3_hash} of the backbone, {path} has {found}; give the one it was trained with by "
             "--policy.da3_encoder."
         )
@@ -70,7 +73,7 @@ def backbone_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def _find(encoder: str) -> Path:
+def find_encoder(encoder: str) -> Path:
     """The encoder's file: `encoder` is that file, its folder, or a hub id."""
     if Path(encoder).is_file():
         return Path(encoder)

@@ -30,12 +30,14 @@ from .geometry import GeometryEncoder, GeometrySource
 from .geometry.da3 import Da3Encoder, Da3Source
 from .geometry.random_tokens import RandomSource
 from .geometry.rgbd import RgbdSource
+from .geometry.store import FeatureStoreSource
 from .geometry.unknown_cameras import UnknownCameras
 from .inputs import check_calibration, check_stats, prepare_images, resolve_calibration
 from .model import PI05Pytorch
 from .model.flow import FlowDraw, draw_flow
 from .model.sampler import ChunkSampler
 from .prompt import SMALL_TOKENIZER, small_number_ids
+from .stored import open_store
 
 logger = logging.getLogger(__name__)
 
@@ -59,7 +61,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     ) -> None:
         """dataset_stats, dataset_meta: what LeRobot's `make_policy` passes; the rest of it is not needed.
 
-        encoder: for geometry_source=da3, what `load_da3` returned for this configuration; None: it is called here.
+        encoder: for a policy that looks live (da3, or features without a dataset), what `load_da3` returned for this
+        configuration; None: it is called here.
         """
         super().__init__(config)
         config.validate_features()
@@ -89,8 +92,10 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         config = self.config
         if config.geometry_source == "none":
             return None
-        if config.geometry_source == "da3":
+        if config.geometry_source == "da3" or (config.geometry_source == "features" and dataset_meta is None):
             return self._build_da3(encoder)
+        if config.geometry_source == "features":
+            return self._build_features(Path(dataset_meta.root))
         sizes = config.depth_cameras()
         if config.geometry_pending and sizes:
             self._accept_cameras(list(sizes))
@@ -124,19 +129,24 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             max_depth=config.max_depth,
         )
 
-    def _build_da3(self, encoder: Da3Encoder | None) -> Da3Source:
+    def _build_da3(self, encoder: Da3Encoder | None = None) -> Da3Source:
         config = self.config
         keys = config.rgb_cameras()
         if not keys:
             raise ValueError(
-                "geometry_source=da3 looks at RGB images, but the data has none; use geometry_source=none."
+                f"geometry_source={config.geometry_source} looks at RGB images, but the data has none; use geometry_source=none."
+            )
+        if config.geometry_source == "features" and config.da3_hash is None:
+            raise ValueError(
+                "geometry_source=features reads features of a dataset's frames, and there is no dataset to train on; use "
+                "geometry_source=da3."
             )
         return Da3Source(
             keys,
             config.geometry_grid,
             load_da3(config) if encoder is None else encoder,
             config.da3_image_size,
-            optional={camera for camera, key in keys.items() if config.may_be_absent(key)},
+            optional=config.optional_rgb_cameras(),
         )
 
     def _accept_cameras(self, cameras: list[str]) -> None:
@@ -149,6 +159,11 @@ class PI05GeometryPolicy(PreTrainedPolicy):
                 "--policy.geometry_cameras."
             )
         self.config.geometry_pending = 0
+
+    def _build_features(self, root: Path) -> FeatureStoreSource:
+        """The feature store of the dataset to train on. A policy without a dataset looks live."""
+        config = self.config
+        return FeatureStoreSource(open_store(config, root), self._build_da3, config.optional_rgb_cameras())
 
     def _set_trainable(self) -> None:
         network = self.model.paligemma_with_expert
@@ -190,7 +205,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         weights = find_file(pretrained_name_or_path, SAFETENSORS_SINGLE_FILE, **hub)
         if config is None:
             config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, **hub)
-        if isinstance(config, PI05GeometryConfig) and config.geometry_source == "da3":
+        live = ("da3", "features") if kwargs.get("dataset_meta") is None else ("da3",)
+        if isinstance(config, PI05GeometryConfig) and config.geometry_source in live:
             kwargs["encoder"] = load_da3(config)  # before, since in there every parameter becomes an empty one
         with init_empty_weights(include_buffers=False):
             policy = cls(config, **kwargs)

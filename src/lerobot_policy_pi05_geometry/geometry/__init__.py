@@ -10,6 +10,7 @@
    source        the contract                                     rgbd, random_tokens   sources
    images        RGB of any layout -> (B, 3, H, W)                da3           a frozen encoder of RGB images, as a source
    adapter       features -> tokens, trainable                    encoder       source + adapter, and failing cameras
+   store         a dataset's features, computed once
 ```
 
 V cameras, G = grid x grid cells per camera. A cell with no valid measurement is masked, never zero; an absent camera is

@@ -16,6 +16,8 @@ from lerobot.scripts.lerobot_train import train
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from ..stored import refuse_augmentation
+
 
 class FramesInMemory(Dataset):
     """The samples of a LeRobotDataset that has action chunks and no observation history, each frame decoded once."""
@@ -72,6 +74,7 @@ class InMemoryAccelerator(Accelerator):
 def train_in_memory(cfg: TrainPipelineConfig) -> None:
     """`lerobot-train`, with the same arguments, for a dataset whose frames fit into memory."""
     cfg.validate()
+    refuse_augmentation(cfg)
     policy = cfg.trainable_config
     precision = {"bfloat16": "bf16", "float16": "fp16"}.get(getattr(policy, "dtype", ""), "no")
     accelerator = InMemoryAccelerator(

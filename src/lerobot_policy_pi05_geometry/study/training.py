@@ -2,8 +2,11 @@
 
 import sys
 
+from lerobot.configs import parser
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts.lerobot_train import train
 
+from ..stored import refuse_augmentation
 from .frames_in_memory import train_in_memory
 
 
@@ -13,4 +16,12 @@ def train_with(arguments: list[str], in_memory: bool = True) -> None:
     in_memory: keep decoded frames in memory (images that fit; see frames_in_memory.py), or read them as LeRobot does.
     """
     sys.argv = ["lerobot-train", *arguments]
-    (train_in_memory if in_memory else train)()
+    (train_in_memory if in_memory else train_from_disk)()
+
+
+@parser.wrap()
+def train_from_disk(cfg: TrainPipelineConfig) -> None:
+    """`lerobot-train`, with the same arguments, after a look at what only the whole configuration shows."""
+    cfg.validate()
+    refuse_augmentation(cfg)
+    train(cfg)

@@ -1,0 +1,50 @@
+"""Tiny LeRobotDatasets with two RGB cameras, without a simulator."""
+
+from pathlib import Path
+
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_policy_pi05_geometry.quantiles import write_frame_quantiles
+
+FPS, STATE_DIM, ACTION_DIM = 10, 7, 5
+REPO_ID = "local/tiny"
+
+
+def write_dataset(
+    root: Path, lengths: tuple[int, ...] = (9, 5, 12), videos: bool = False, size: int = 28, seed: int = 0
+) -> Path:
+    """Episodes of these lengths; every image is a gradient of its own colour, which a video codec keeps apart."""
+    kind = "video" if videos else "image"
+    features = {
+        **{
+            f"observation.images.{camera}": {
+                "dtype": kind,
+                "shape": (size, size, 3),
+                "names": ["height", "width", "channels"],
+            }
+            for camera in ("front", "wrist")
+        },
+        "observation.state": {"dtype": "float32", "shape": (STATE_DIM,), "names": None},
+        "action": {"dtype": "float32", "shape": (ACTION_DIM,), "names": None},
+    }
+    dataset = LeRobotDataset.create(REPO_ID, fps=FPS, features=features, root=root, use_videos=videos)
+    random = np.random.default_rng(seed)
+    ramp = np.linspace(0.2, 1.0, size)[:, None, None] * np.linspace(0.5, 1.0, size)[None, :, None]
+    for length in lengths:
+        for _ in range(length):
+            dataset.add_frame(
+                {
+                    **{
+                        f"observation.images.{camera}": (ramp * random.integers(40, 255, 3)).astype(np.uint8)
+                        for camera in ("front", "wrist")
+                    },
+                    "observation.state": random.uniform(-1, 1, STATE_DIM).astype(np.float32),
+                    "action": random.uniform(-1, 1, ACTION_DIM).astype(np.float32),
+                    "task": "push",
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    write_frame_quantiles(root, REPO_ID)
+    return root
