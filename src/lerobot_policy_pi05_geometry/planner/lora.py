@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -51,11 +52,13 @@ def add_lora(policy: nn.Module, plan: LoraPlan) -> None:
     for name, parameter in policy.named_parameters():
         parameter.requires_grad_(name.startswith("geometry.") or ".geometry_gate." in name)
     for layer in lora_layers(policy, plan.target).values():
-        layer.register_parameter("lora_down", nn.Parameter(torch.empty(plan.rank, layer.in_features)))
-        layer.register_parameter("lora_up", nn.Parameter(torch.empty(layer.out_features, plan.rank)))
-        layer.register_forward_hook(_low_rank)
+        down = nn.Parameter(torch.empty(plan.rank, layer.in_features))
+        up = nn.Parameter(torch.empty(layer.out_features, plan.rank))
+        layer.register_parameter("lora_down", down)
+        layer.register_parameter("lora_up", up)
+        layer.register_forward_hook(partial(_low_rank, down, up))
 
 
-def _low_rank(layer: nn.Module, args: tuple[Any, ...], output: Tensor) -> Tensor:
-    low = F.linear(args[0].to(layer.lora_down.dtype), layer.lora_down)
-    return (output + F.linear(low, layer.lora_up) * 1.0).to(output.dtype)
+def _low_rank(down: Tensor, up: Tensor, layer: nn.Module, args: tuple[Any, ...], output: Tensor) -> Tensor:
+    low = F.linear(args[0].to(down.dtype), down)
+    return (output + F.linear(low, up) * 1.0).to(output.dtype)  # times PEFT's scaling

@@ -55,14 +55,14 @@ def explanation(config: PI05GeometryConfig, load: Load) -> str:
         "The second training step, when the optimiser's state is there, and one action chunk were run on fake tensors, which "
         "have shapes and dtypes but no memory, and the bytes that live at once were added up. The peak is the larger of "
         "forward and backward pass, and optimiser's step.",
-        "[bold]weights[/bold] parameters and buffers; [bold]gradients[/bold] of what is trained; [bold]optimiser[/bold] two "
-        "moments per trained parameter, of one byte each with 8-bit AdamW; [bold]activations[/bold] all the rest: inputs, intermediates, "
-        "weights cast to bfloat16, what AdamW needs during its step; [bold]cache[/bold] an observation's keys and values.",
+        "[bold]activations[/bold] are all that has no other name: inputs, intermediates, weights cast to bfloat16, what AdamW "
+        "needs during its step. [bold]optimiser[/bold]: two moments per trained parameter, of one byte each with 8-bit AdamW. "
+        "[bold]cache[/bold]: an observation's keys and values.",
         "[bold]What was assumed[/bold]",
-        f"Images: {cameras}, float32 on the GPU as LeRobot's loader gives them. Prompts padded to {load.prompt_tokens} tokens.",
+        f"Images: {cameras}, float32 on the GPU as LeRobot's loader gives them. Prompts of {load.prompt_tokens} tokens.",
         "One GPU; DDP adds the gradients once more, for its buckets. AdamW's foreach variant, PyTorch's default on CUDA. "
-        "Attention by a fused kernel, which keeps no matrix of weights, but for the suffix while its gate is trained. Blocks of 512 bytes.",
-        f"GPU needed is the peak and {FRAGMENTATION:.0%} of it for fragmentation and {CONTEXT / GIB:.2f} GiB for CUDA's context "
+        "Attention by a fused kernel, which keeps no matrix of weights, but for the suffix while its gate is trained.",
+        f"GPU needed is the peak, {FRAGMENTATION:.0%} of it for fragmentation, and {CONTEXT / GIB:.2f} GiB for CUDA's context "
         "and workspaces. These two margins are assumptions; no GPU was at hand to measure them.",
     )
     return "\n".join(lines)
