@@ -48,8 +48,8 @@ def test_the_largest_batch_that_fits(static, offset, slope, recomputed, wanted, 
     assert outcome.checkpointing == (fixed if fixed is not None else not (expected == wanted and fits(wanted, False)))
 
 
-def outcomes(budget: int, fixed: Fixed | None = None) -> list[Proposal | Rejection]:
-    return list(propose(lambda settings: make_config(**settings), LOAD, budget, fixed or Fixed()))
+def outcomes(budget: int, fixed: Fixed | None = None, load: Load = LOAD) -> list[Proposal | Rejection]:
+    return list(propose(lambda settings: make_config(**settings), load, budget, fixed or Fixed()))
 
 
 def test_with_room_enough_everything_is_proposed_in_order_without_checkpointing():
@@ -72,12 +72,14 @@ def test_what_is_proposed_is_what_is_predicted():
 
 
 def test_less_room_means_less_at_once():
-    whole = needed(outcomes(2**40, Fixed({"gradient_checkpointing": True}))[0].split)
-    first = outcomes(whole - 1, Fixed({"gradient_checkpointing": True}))[0]
-    assert first.recipe.name == NAMES[0]
-    assert first.load.rows < LOAD.batch_size
+    """With so many samples that activations outweigh the gradients, which every micro-batch but the first finds there."""
+    fixed, load = Fixed({"gradient_checkpointing": True, "train_expert_only": True}), replace(LOAD, batch_size=64)
+    whole = needed(outcomes(2**40, fixed, load)[0].split)
+    first = outcomes(whole - 1, fixed, load)[0]
+    assert first.recipe.name == "action expert only"
+    assert first.load.rows < 64
     assert f"--policy.micro_batch_size={first.load.rows}" in first.options()
-    assert "--batch_size=8" in first.options()
+    assert "--batch_size=64" in first.options()
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,8 @@ def configuration(options: Mapping[str, str]) -> PI05GeometryConfig:
         return draccus.parse(PI05GeometryConfig, args=arguments)
     except draccus.utils.DecodingError as error:
         raise ValueError(f"A setting of the policy cannot be read: {error}.") from error
+    except draccus.ParsingError as error:  # of a configuration that refuses its settings: its own sentence
+        raise ValueError(str(error.__cause__ or error)) from error
 
 
 def typed(options: Mapping[str, str], config: PI05GeometryConfig) -> dict[str, Any]:
