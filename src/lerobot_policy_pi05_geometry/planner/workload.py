@@ -88,10 +88,12 @@ class FakePolicy:
         if config.geometry_source == "da3":
             if da3 is None:
                 raise ValueError("geometry_source=da3 needs the encoder's size to be planned.")
-            with self.mode:
+            with torch.device("meta"):
                 backbone = Da3Backbone(da3)
-                store_products_in(backbone, DTYPES[config.da3_dtype])
-                encoder = Da3Encoder(backbone, DTYPES[config.da3_dtype])
+            store_products_in(backbone, DTYPES[config.da3_dtype])
+            encoder = Da3Encoder(backbone, DTYPES[config.da3_dtype])
+            with self.mode:
+                encoder.to_empty(device=CPU)
         with init_empty_weights(include_buffers=False):
             self.policy = PI05GeometryPolicy(config, encoder=encoder)
         with self.mode:
