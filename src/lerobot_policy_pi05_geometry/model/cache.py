@@ -12,6 +12,7 @@ break autograd, so training concatenates instead (see `gemma.py`).
 """
 
 from collections.abc import Sequence
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -36,7 +37,7 @@ class SegmentKVCache:
         device: torch.device,
     ) -> None:
         self.lengths = tuple(lengths)
-        ends = torch.tensor(self.lengths).cumsum(0).tolist()
+        ends = list(accumulate(self.lengths))
         self._spans = [slice(end - length, end) for end, length in zip(ends, self.lengths, strict=True)]
         shape = (num_layers, batch, num_kv_heads, ends[-1], head_dim)
         self.keys = torch.zeros(shape, dtype=dtype, device=device)

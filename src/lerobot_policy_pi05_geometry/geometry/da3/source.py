@@ -71,7 +71,8 @@ class Da3Source(GeometrySource):
         valid = torch.zeros(shape, dtype=torch.bool, device=like.device)
         if present:
             images = torch.stack([self._image(self.cameras[i], batch) for i in present], dim=1)
-            self.encoder.to(images.device)  # it is nobody's submodule, so it follows the images
+            if self.encoder.mean.device != images.device:  # it is nobody's submodule, so it follows the images
+                self.encoder.to(images.device)
             pooled = pool(self.encoder(images), self.grid)
             for view, i in enumerate(present):
                 features[:, i] = pooled[:, view]
