@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import RenderableType
 
-from ..configuration_pi05_geometry import PI05GeometryConfig
+from ..configuration_pi05_geometry import DEFAULT_ENCODER, PI05GeometryConfig
 from .configuration import complete
 from .gpus import GIB, gpu_bytes
 from .lora import LORA_TARGETS, LoraPlan
@@ -58,7 +58,7 @@ def run(arguments: Sequence[str], data: Data, wish: Wish) -> Iterator[Renderable
         if wish.lora not in LORA_TARGETS:
             raise ValueError(f"--lora must be one of {', '.join(LORA_TARGETS)}, got '{wish.lora}'.")
         lora = LoraPlan(wish.lora_rank, wish.lora)
-    da3 = da3_variant(config.da3_encoder) if config.geometry_source == "da3" else None
+    da3 = da3_variant(config.da3_encoder or DEFAULT_ENCODER) if config.geometry_source == "da3" else None
     load = Load(
         wish.batch_size,
         wish.micro_batch_size,

@@ -163,7 +163,10 @@ class FakePolicy:
         return self._steps[load]
 
     def inference(self, load: Load) -> MemorySplit:
-        """The largest moment of predicting one action chunk. Two denoising steps stand for all: the third is as the second."""
+        """The largest moment of predicting one action chunk by the plain path. Two denoising steps stand for all.
+
+        The runner needs as much, and its masks and modulations beyond: some 20 MB at the released size.
+        """
         policy = self.policy.eval()
         with ExitStack() as stack, torch.no_grad():
             counter = self._counter(stack, load.target)
