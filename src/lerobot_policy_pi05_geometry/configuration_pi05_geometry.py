@@ -127,6 +127,8 @@ class PI05GeometryConfig(PreTrainedConfig):
     )
 
     gradient_checkpointing: bool = False
+    # Samples whose activations are held at once; a larger batch is processed in several goes. 0: the whole batch.
+    micro_batch_size: int | None = None
     freeze_vision_encoder: bool = False
     train_expert_only: bool = False
 
@@ -158,6 +160,8 @@ class PI05GeometryConfig(PreTrainedConfig):
         for name in ("chunk_size", "n_action_steps", "num_inference_steps", "geometry_grid", "flow_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.micro_batch_size is not None and self.micro_batch_size < 0:
+            raise ValueError(f"micro_batch_size must be 0 (off) or more, got {self.micro_batch_size}.")
         if self.n_obs_steps != 1:
             raise ValueError(
                 f"This policy sees one observation at a time: n_obs_steps must be 1, got {self.n_obs_steps}."
