@@ -23,6 +23,7 @@ from .model.config import (
 )
 from .model.precision import DTYPES
 from .model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
+from .optimizer import OPTIMIZERS, AdamW8bitConfig
 from .prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
 
 logger = logging.getLogger(__name__)
@@ -30,6 +31,8 @@ logger = logging.getLogger(__name__)
 EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
 
 _CHOICES = {
+    "optimizer": OPTIMIZERS,
+    "lora_targets": ("expert", "expert+vlm"),
     "paligemma_variant": tuple(PALIGEMMA_VARIANTS),
     "action_expert_variant": tuple(EXPERT_VARIANTS),
     "dtype": tuple(DTYPES),
@@ -131,7 +134,10 @@ class PI05GeometryConfig(PreTrainedConfig):
     micro_batch_size: int | None = None
     freeze_vision_encoder: bool = False
     train_expert_only: bool = False
+    lora_targets: str = "expert"  # with --peft.*: matrices that get LoRA, of the expert or of expert+vlm
 
+    # adamw, or adamw8bit: moments in 8 bits, but for the new parameters (needs torchao)
+    optimizer: str = "adamw"
     optimizer_lr: float = 2.5e-5
     optimizer_betas: tuple[float, float] = (0.9, 0.95)
     optimizer_eps: float = 1e-8
@@ -311,7 +317,8 @@ class PI05GeometryConfig(PreTrainedConfig):
         return image_key in self.absent_cameras or image_key.startswith(EMPTY_CAMERA)
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
+        kind = AdamW8bitConfig if self.optimizer == "adamw8bit" else AdamWConfig
+        return kind(
             lr=self.optimizer_lr,
             betas=self.optimizer_betas,
             eps=self.optimizer_eps,

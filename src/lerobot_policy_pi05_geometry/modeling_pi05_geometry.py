@@ -34,15 +34,29 @@ from .geometry.random_tokens import RandomSource
 from .geometry.rgbd import RgbdSource
 from .geometry.unknown_cameras import UnknownCameras
 from .inputs import check_calibration, check_stats, prepare_images, resolve_calibration
+from .lora import always_in_full, peft_targets
 from .micro_batches import each_of, require_whole_parameters, rows_of, sum_of
 from .model import PI05Pytorch
 from .model.flow import FlowDraw, draw_flow
+from .optimizer import FULL_STATE
 from .prompt import SMALL_TOKENIZER, small_number_ids
 
 logger = logging.getLogger(__name__)
 
 GATE = ".geometry_gate."  # in the name of the gate's parameter
 _EVALUATION_STEP = -1  # evaluation loss draws the same noise at every training step, so that its curve is comparable
+
+
+class TrainingProgress(nn.Module):
+    """Optimiser steps done, kept in the checkpoint: noise is keyed by them (see model/flow.py).
+
+    A module, so that PEFT can save it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.step: Tensor
+        self.register_buffer("step", torch.zeros((), dtype=torch.int64))
 
 
 class PI05GeometryPolicy(PreTrainedPolicy):
@@ -77,8 +91,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self._set_trainable()
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
-        # Optimiser steps done, kept in the checkpoint: noise is keyed by it (see model/flow.py).
-        self.register_buffer("training_step", torch.zeros((), dtype=torch.int64))
+        self.progress = TrainingProgress()
         self._noise_seed = torch.initial_seed()
         self._last_update: dict[str, Tensor] = {}
         if not self.model.action_in_proj.weight.is_meta:  # from_pretrained fills the weights first
@@ -200,6 +213,21 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         policy.eval()
         return policy
 
+    @property
+    def training_step(self) -> Tensor:
+        """Optimiser steps done, a scalar on the policy's device."""
+        return self.progress.step
+
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        """LeRobot asks here what `--peft.*` trains."""
+        return peft_targets(self.config)
+
+    def _validate_peft_config(self, peft_config: Any) -> None:
+        """LeRobot asks here about a PEFT configuration before it uses it; the new parameters are always trained."""
+        super()._validate_peft_config(peft_config)
+        given = list(peft_config.modules_to_save or [])
+        peft_config.modules_to_save = given + [name for name in always_in_full(self.config) if name not in given]
+
     # --- training -------------------------------------------------------------------------------------------------
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
@@ -301,15 +329,18 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         ]
         gate = [p for name, p in new.items() if GATE in name]
         rest = [p for name, p in new.items() if GATE not in name]
+        common: dict[str, Any] = {"eps": self.config.geometry_eps, "weight_decay": 0.0}
+        if self.config.optimizer == "adamw8bit":
+            common[FULL_STATE] = True
         for params, lr in ((rest, self.config.geometry_lr), (gate, self.config.geometry_gate_lr)):
             if params:
-                groups.append({"params": params, "lr": lr, "eps": self.config.geometry_eps, "weight_decay": 0.0})
+                groups.append({"params": params, "lr": lr, **common})
         return groups
 
     @torch.no_grad()
     def update(self) -> None:
         """LeRobot calls this after every optimiser step: count it, and measure how far the new parameters moved."""
-        self.training_step += 1
+        self.training_step.add_(1)
         now = [p.detach().clone() for p in self.new_parameters().values() if p.requires_grad]
         before = getattr(self, "_previous", None)
         self._previous = now
