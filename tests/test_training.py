@@ -174,6 +174,37 @@ def test_eight_bits_and_micro_batches_are_trained_and_resumed_bit_for_bit(datase
     assert any(name.endswith("exp_avg_codes") for name in tensors(last))
 
 
+def test_lora_is_trained_and_resumed_bit_for_bit(trained, dataset, tmp_path):
+    """The noise is keyed by a count of steps, which is saved among the adapters."""
+    pytest.importorskip("peft")
+    base = shutil.copytree(trained[0] / "checkpoints" / "000003" / "pretrained_model", tmp_path / "base")
+    options = [a for a in arguments(dataset, tmp_path / "run", 2) if not a.startswith("--policy.")]
+    options += ["--policy.device=cpu", "--policy.push_to_hub=false", f"--policy.path={base}", "--peft.r=4"]
+    lerobot("train", *options)
+    checkpoints = tmp_path / "run" / "checkpoints"
+    shutil.move(checkpoints / "000002", tmp_path / "uninterrupted")
+    (checkpoints / "last").unlink()
+    lerobot("train", f"--config_path={checkpoints / '000001/pretrained_model/train_config.json'}", "--resume=true")
+    expected, found = tensors(tmp_path / "uninterrupted"), tensors(checkpoints / "000002")
+    assert found.keys() == expected.keys()
+    (step,) = (tensor for name, tensor in found.items() if name.endswith("progress.step"))
+    assert step == load_file(base / "model.safetensors")["progress.step"] + 2
+    for name, tensor in expected.items():
+        assert torch.equal(found[name], tensor), name
+    lerobot(
+        "eval",
+        f"--policy.path={checkpoints / '000002' / 'pretrained_model'}",
+        "--policy.device=cpu",
+        "--env.type=metaworld_rgbd",
+        f"--env.image_size={SIZE}",
+        "--env.episode_length=2",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        "--eval.use_async_envs=false",
+        f"--output_dir={tmp_path / 'evaluation'}",
+    )
+
+
 def test_geometry_from_rgb_is_trained_and_resumed_bit_for_bit(dataset, tmp_path):
     encoder = write_tiny(tmp_path / "encoder" / "model.safetensors").parent
     rgb = ["--policy.geometry_source=da3", f"--policy.da3_encoder={encoder}", "--policy.da3_image_size=56"]
