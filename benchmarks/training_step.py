@@ -5,9 +5,11 @@
     python -m benchmarks.training_step --size full --device cuda    released size, bf16 compute over float32 weights
     python -m benchmarks.training_step --flow-samples 20   loss after 20 s of training at K = 1, 2, 4, 8
 
-Forward and backward, no optimiser. All arms run the same weights and batch in one process, in turn, round by round; a ratio is
-the median over rounds of ours / LeRobot's in the same round. Memory is the peak of live tensors in one step, with weights and
-gradients. Ours pads prompts to what the batch needs (`--prompt`), LeRobot's always to 200: `--prompt 200` takes that apart.
+The step against LeRobot's is forward and backward, without an optimiser. All arms run the same weights and batch in one
+process, in turn, round by round; a ratio is the median over rounds of ours / LeRobot's in the same round. On a machine that
+others use too, `--cpu-time` with one thread (OMP_NUM_THREADS=1) counts what this process has used. Memory is the peak of live tensors
+in one step, weights and gradients included. Ours pads prompts to what the batch needs (`--prompt`), LeRobot's always to 200:
+`--prompt 200` takes that apart.
 """
 
 import argparse
@@ -15,7 +17,7 @@ import json
 import statistics
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -78,8 +80,8 @@ class _LiveTensors(TorchDispatchMode):
         return result
 
 
-def peak_memory(module: nn.Module, step: Callable[[], None]) -> float:
-    """MiB of live tensors at the peak of a step that starts without gradients."""
+def peak_memory(module: nn.Module, step: Callable[[], None], held: Sequence[Tensor] = ()) -> float:
+    """MiB of live tensors at the peak of a step that starts without gradients; `held` is there beside the module's."""
     module.zero_grad()
     device = next(module.parameters()).device
     if device.type == "cuda":
@@ -87,7 +89,7 @@ def peak_memory(module: nn.Module, step: Callable[[], None]) -> float:
         step()
         return torch.cuda.max_memory_allocated() / 2**20
     with _LiveTensors() as live:
-        for tensor in (*module.parameters(), *module.buffers()):
+        for tensor in (*module.parameters(), *module.buffers(), *held):
             live.add(tensor)
         step()
     return live.peak / 2**20
@@ -150,13 +152,14 @@ def network_steps(args: argparse.Namespace, networks: dict[str, nn.Module]) -> d
 def against_lerobot(args: argparse.Namespace) -> dict[str, Any]:
     networks = build_networks(args)
     steps = network_steps(args, networks)
+    clock = time.process_time if args.cpu_time else time.perf_counter
     seconds: dict[str, list[float]] = {arm: [] for arm in ARMS}
     for round_index in range(args.rounds + 1):
         for arm, step in steps.items():
-            start = time.perf_counter()
+            start = clock()
             step()
             if round_index:  # the first round warms up
-                seconds[arm].append(time.perf_counter() - start)
+                seconds[arm].append(clock() - start)
     for network in networks.values():
         network.zero_grad()
     memory = {arm: peak_memory(networks["lerobot" if arm == "lerobot" else "ours"], steps[arm]) for arm in ARMS}
@@ -214,18 +217,35 @@ def policy_batch(args: argparse.Namespace, size: int, seed: int) -> dict[str, Te
 
 
 def micro_batches(args: argparse.Namespace) -> dict[str, Any]:
-    """Peak of a batch of 32 in micro-batches of 4, and of batches of 4 and 32 at once."""
+    """Peaks of a batch of 32 in micro-batches of 4, and of batches of 4 and 32 at once: of forward and backward, and of a
+    whole training step with AdamW."""
     result: dict[str, Any] = {}
     for checkpointing in (False, True):
-        peaks = {}
-        for name, size, micro in (("4", 4, None), ("32 by 4", 32, 4), ("32", 32, None)):
-            policy = build_policy(args, micro_batch_size=micro, gradient_checkpointing=checkpointing)
-            batch = policy_batch(args, size, 0)
-            peaks[name] = peak_memory(policy, lambda p=policy, b=batch: p.forward(b)[0].backward())
-        result["checkpointing" if checkpointing else "plain"] = peaks | {"ratio": peaks["32 by 4"] / peaks["4"]}
-        print(f"micro-batches, checkpointing {checkpointing}: " + "  ".join(f"{k}: {v:.1f} MiB" for k, v in peaks.items())
-              + f"  32 by 4 over 4: {peaks['32 by 4'] / peaks['4']:.3f}")  # fmt: skip
+        for optimise in (False, True):
+            peaks = {}
+            for name, size, micro in (("4", 4, None), ("32 by 4", 32, 4), ("32", 32, None)):
+                policy = build_policy(args, micro_batch_size=micro, gradient_checkpointing=checkpointing)
+                peaks[name] = step_peak(policy, policy_batch(args, size, 0), optimise)
+            kind = ("step" if optimise else "gradients") + (", checkpointing" if checkpointing else "")
+            result[kind] = peaks | {"ratio": peaks["32 by 4"] / peaks["4"]}
+            print(f"{kind:26}" + "  ".join(f"{k}: {v:7.1f} MiB" for k, v in peaks.items())
+                  + f"  32 by 4 over 4: {result[kind]['ratio']:.3f}")  # fmt: skip
     return result
+
+
+def step_peak(policy: PI05GeometryPolicy, batch: dict[str, Tensor], optimise: bool) -> float:
+    """MiB of one step; with the optimiser, of one that is not the first, so that its moments are there."""
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+
+    def step() -> None:
+        policy.forward(batch)[0].backward()
+        if optimise:
+            optimizer.step()
+            optimizer.zero_grad()
+
+    if optimise:
+        step()
+    return peak_memory(policy, step, [t for state in optimizer.state.values() for t in state.values()])
 
 
 @contextmanager
@@ -240,28 +260,27 @@ def evaluation(policy: PI05GeometryPolicy) -> Iterator[None]:
 
 def flow_samples(args: argparse.Namespace) -> dict[str, Any]:
     """Held-out loss after the same time of training, per K; and what K costs per step."""
+    clock = time.process_time if args.cpu_time else time.perf_counter
     result: dict[str, Any] = {}
     held_out = policy_batch(args, 64, 999)
     for K in (1, 2, 4, 8):
         policy = build_policy(args, flow_samples=K, optimizer_lr=1e-3)
         optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
-        curve, trained, step = [], 0.0, 0
-        policy.config.flow_samples = 1  # the same noise for everyone
+        trained, step = 0.0, 0
         while trained < args.flow_samples:
             batch = policy_batch(args, args.batch, step + 1)
-            policy.config.flow_samples = K
-            start = time.perf_counter()
+            start = clock()
             policy.forward(batch)[0].backward()
             optimizer.step()
             optimizer.zero_grad()
             policy.update()
-            trained += time.perf_counter() - start
+            trained += clock() - start
             step += 1
-        policy.config.flow_samples = 1
+        policy.config.flow_samples = 1  # the same noise for everyone
         with evaluation(policy):
-            curve = policy.forward(held_out)[1]["loss"]
-        result[str(K)] = {"held_out_loss": curve, "steps": step, "seconds_per_step": trained / step}
-        print(f"K = {K}: {step} steps of {1e3 * trained / step:.0f} ms, held-out loss {curve:.4f}")
+            loss = policy.forward(held_out)[1]["loss"]
+        result[str(K)] = {"held_out_loss": loss, "steps": step, "seconds_per_step": trained / step}
+        print(f"K = {K}: {step} steps of {1e3 * trained / step:.0f} ms, held-out loss {loss:.4f}")
     return result
 
 
@@ -273,6 +292,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, default=1)
     parser.add_argument("--prompt", type=int, default=100, help="prompt tokens; a state of 14 numbers takes some 70")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--cpu-time", action="store_true", help="time that the process has used, not that has passed")
     parser.add_argument("--flow-samples", type=float, metavar="SECONDS", help="train so long at K = 1, 2, 4, 8")
     parser.add_argument("--output", help="write the numbers to this JSON file")
     args = parser.parse_args()
