@@ -8,8 +8,8 @@
 The step against LeRobot's is forward and backward, without an optimiser. All arms run the same weights and batch in one
 process, in turn, round by round; a ratio is the median over rounds of ours / LeRobot's in the same round. On a machine that
 others use too, `--cpu-time` with one thread (OMP_NUM_THREADS=1) counts what this process has used. Memory is the peak of live
-tensors in one step, weights and gradients included. Ours pads prompts to what the batch needs (`--prompt`), LeRobot's always to 200:
-`--prompt 200` takes that apart.
+tensors in one step, weights and gradients included. Ours pads prompts to what the batch needs (`--prompt`), LeRobot's always to
+200: `--prompt 200` takes that apart.
 """
 
 import argparse
