@@ -102,7 +102,7 @@ def test_the_checkpoint_records_the_encoder_and_holds_nothing_of_it(encoder, tmp
     assert config["da3_encoder"] == str(encoder)
     assert config["da3_hash"] == backbone_hash(encoder / "model.safetensors")
     names = set(load_file(tmp_path / "model.safetensors"))
-    assert names == {name for name, _ in policy.named_parameters()} | {"training_step"}
+    assert names == {name for name, _ in policy.named_parameters()} | {"progress.step"}
     assert {name for name in names if name.startswith("geometry.")} == {
         f"geometry.{name}" for name, _ in policy.geometry.named_parameters()
     }

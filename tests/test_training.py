@@ -94,7 +94,7 @@ def test_training_moves_every_trainable_weight_and_counts_its_steps(trained):
     checkpoints = trained[0] / "checkpoints"
     before = load_file(checkpoints / "000003" / "pretrained_model" / "model.safetensors")
     after = load_file(checkpoints / "000006" / "pretrained_model" / "model.safetensors")
-    assert (before["training_step"], after["training_step"]) == (3, 6)
+    assert (before["progress.step"], after["progress.step"]) == (3, 6)
     for name in ("model.action_in_proj.weight", "geometry.adapter.fc_in.weight"):
         assert not torch.equal(before[name], after[name]), name
     assert all(tensor.isfinite().all() for tensor in after.values())
@@ -152,21 +152,65 @@ def test_a_checkpoint_is_evaluated_in_the_environment(trained, tmp_path):
     assert info["overall"]["pc_success"] in (0.0, 50.0, 100.0)
 
 
-def test_geometry_from_rgb_is_trained_and_resumed_bit_for_bit(dataset, tmp_path):
-    encoder = write_tiny(tmp_path / "encoder" / "model.safetensors").parent
-    output = tmp_path / "run"
-    rgb = ["--policy.geometry_source=da3", f"--policy.da3_encoder={encoder}", "--policy.da3_image_size=56"]
-    lerobot("train", *arguments(dataset, output, steps=2), *rgb)
+def assert_resumes_bit_for_bit(dataset: Path, folder: Path, *options: str) -> Path:
+    """Two steps, and one step resumed for another, leave the same tensors behind. Returns the last checkpoint."""
+    output = folder / "run"
+    lerobot("train", *arguments(dataset, output, steps=2), *options)
     checkpoints = output / "checkpoints"
-    config = json.loads((checkpoints / "last" / "pretrained_model" / "config.json").read_text())
-    assert config["da3_hash"] == backbone_hash(encoder / "model.safetensors")
+    shutil.move(checkpoints / "000002", folder / "uninterrupted")
+    (checkpoints / "last").unlink()
+    lerobot("train", f"--config_path={checkpoints / '000001/pretrained_model/train_config.json'}", "--resume=true")
+    expected, found = tensors(folder / "uninterrupted"), tensors(checkpoints / "000002")
+    assert any("optimizer_state" in name for name in expected)
+    assert found.keys() == expected.keys()
+    for name, tensor in expected.items():
+        assert torch.equal(found[name], tensor), name
+    return checkpoints / "000002"
+
+
+def test_eight_bits_and_micro_batches_are_trained_and_resumed_bit_for_bit(dataset, tmp_path):
+    pytest.importorskip("torchao")
+    last = assert_resumes_bit_for_bit(dataset, tmp_path, "--policy.optimizer=adamw8bit", "--policy.micro_batch_size=3")
+    assert any(name.endswith("exp_avg_codes") for name in tensors(last))
+
+
+def test_lora_is_trained_and_resumed_bit_for_bit(trained, dataset, tmp_path):
+    """The noise is keyed by a count of steps, which is saved among the adapters."""
+    pytest.importorskip("peft")
+    base = shutil.copytree(trained[0] / "checkpoints" / "000003" / "pretrained_model", tmp_path / "base")
+    options = [a for a in arguments(dataset, tmp_path / "run", 2) if not a.startswith("--policy.")]
+    options += ["--policy.device=cpu", "--policy.push_to_hub=false", f"--policy.path={base}", "--peft.r=4"]
+    lerobot("train", *options)
+    checkpoints = tmp_path / "run" / "checkpoints"
     shutil.move(checkpoints / "000002", tmp_path / "uninterrupted")
     (checkpoints / "last").unlink()
     lerobot("train", f"--config_path={checkpoints / '000001/pretrained_model/train_config.json'}", "--resume=true")
     expected, found = tensors(tmp_path / "uninterrupted"), tensors(checkpoints / "000002")
     assert found.keys() == expected.keys()
+    (step,) = (tensor for name, tensor in found.items() if name.endswith("progress.step"))
+    assert step == load_file(base / "model.safetensors")["progress.step"] + 2
     for name, tensor in expected.items():
         assert torch.equal(found[name], tensor), name
+    lerobot(
+        "eval",
+        f"--policy.path={checkpoints / '000002' / 'pretrained_model'}",
+        "--policy.device=cpu",
+        "--env.type=metaworld_rgbd",
+        f"--env.image_size={SIZE}",
+        "--env.episode_length=2",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        "--eval.use_async_envs=false",
+        f"--output_dir={tmp_path / 'evaluation'}",
+    )
+
+
+def test_geometry_from_rgb_is_trained_and_resumed_bit_for_bit(dataset, tmp_path):
+    encoder = write_tiny(tmp_path / "encoder" / "model.safetensors").parent
+    rgb = ["--policy.geometry_source=da3", f"--policy.da3_encoder={encoder}", "--policy.da3_image_size=56"]
+    last = assert_resumes_bit_for_bit(dataset, tmp_path, *rgb)
+    config = json.loads((last / "pretrained_model" / "config.json").read_text())
+    assert config["da3_hash"] == backbone_hash(encoder / "model.safetensors")
 
 
 @pytest.mark.parametrize("from_data", [False, True])
@@ -204,7 +248,7 @@ def test_a_converted_pi05_trains_on_depth_that_it_has_never_seen(dataset, tmp_pa
     }
     assert config["calibration"]["front"]["size"] == [SIZE, SIZE]
     before, after = load_file(converted / "model.safetensors"), load_file(folder / "model.safetensors")
-    assert after["training_step"] == 2
+    assert after["progress.step"] == 2
     for name in ("geometry.adapter.fc_in.weight", "model.paligemma_with_expert.geometry_gate.log_gate"):
         assert not torch.equal(before[name], after[name]), name
     statistics = load_file(next(folder.glob("*preprocessor*_normalizer_processor.safetensors")))

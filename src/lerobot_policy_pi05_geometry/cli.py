@@ -328,6 +328,18 @@ def inspect(
 
 
 @app.command()
+def merge(
+    checkpoint: Annotated[Path, typer.Argument(help="Folder of a checkpoint that was trained with --peft.")],
+    output: Annotated[Path, typer.Argument(help="Folder to write; it must not be there.")],
+) -> None:
+    """Fold LoRA into the weights: write a checkpoint that acts the same and needs neither PEFT nor its base."""
+    from .merging import merge as run
+
+    run(checkpoint, output)
+    console.print(f"Wrote [bold]{output}[/bold].")
+
+
+@app.command()
 def convert(
     source: Annotated[str, typer.Argument(help="π0.5 checkpoint of LeRobot or openpi (PyTorch): folder or hub id.")],
     output: Annotated[Path, typer.Argument(help="Folder to write; it must not be there.")],

@@ -23,6 +23,7 @@ from .model.config import (
 )
 from .model.precision import DTYPES
 from .model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
+from .optimizer import OPTIMIZERS, AdamW8bitConfig
 from .prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
 
 logger = logging.getLogger(__name__)
@@ -31,6 +32,8 @@ EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
 DEFAULT_ENCODER = "depth-anything/DA3-BASE"
 
 _CHOICES = {
+    "optimizer": OPTIMIZERS,
+    "lora_targets": ("expert", "expert+vlm"),
     "paligemma_variant": tuple(PALIGEMMA_VARIANTS),
     "action_expert_variant": tuple(EXPERT_VARIANTS),
     "dtype": tuple(DTYPES),
@@ -134,9 +137,14 @@ class PI05GeometryConfig(PreTrainedConfig):
     )
 
     gradient_checkpointing: bool = False
+    # Samples whose activations are held at once; a larger batch is processed in several goes. 0: the whole batch.
+    micro_batch_size: int | None = None
     freeze_vision_encoder: bool = False
     train_expert_only: bool = False
+    lora_targets: str = "expert"  # with --peft.*: matrices that get LoRA, of the expert or of expert+vlm
 
+    # adamw, or adamw8bit: moments in 8 bits, but for the new parameters (needs torchao)
+    optimizer: str = "adamw"
     optimizer_lr: float = 2.5e-5
     optimizer_betas: tuple[float, float] = (0.9, 0.95)
     optimizer_eps: float = 1e-8
@@ -167,6 +175,8 @@ class PI05GeometryConfig(PreTrainedConfig):
         for name in ("chunk_size", "n_action_steps", "num_inference_steps", "geometry_grid", "flow_samples"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.micro_batch_size is not None and self.micro_batch_size < 0:
+            raise ValueError(f"micro_batch_size must be 0 (off) or more, got {self.micro_batch_size}.")
         if self.n_obs_steps != 1:
             raise ValueError(
                 f"This policy sees one observation at a time: n_obs_steps must be 1, got {self.n_obs_steps}."
@@ -320,7 +330,8 @@ class PI05GeometryConfig(PreTrainedConfig):
         return image_key in self.absent_cameras or image_key.startswith(EMPTY_CAMERA)
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        return AdamWConfig(
+        kind = AdamW8bitConfig if self.optimizer == "adamw8bit" else AdamWConfig
+        return kind(
             lr=self.optimizer_lr,
             betas=self.optimizer_betas,
             eps=self.optimizer_eps,

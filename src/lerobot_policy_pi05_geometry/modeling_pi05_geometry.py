@@ -10,6 +10,8 @@
 
 import logging
 from collections import deque
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +35,12 @@ from .geometry.rgbd import RgbdSource
 from .geometry.store import FeatureStoreSource
 from .geometry.unknown_cameras import UnknownCameras
 from .inputs import check_calibration, check_stats, prepare_images, resolve_calibration
+from .lora import always_in_full, peft_targets
+from .micro_batches import each_of, require_whole_parameters, rows_of, sum_of
 from .model import PI05Pytorch
 from .model.flow import FlowDraw, draw_flow
 from .model.sampler import ChunkSampler
+from .optimizer import FULL_STATE
 from .prompt import SMALL_TOKENIZER, small_number_ids
 from .stored import open_store
 
@@ -43,6 +48,18 @@ logger = logging.getLogger(__name__)
 
 GATE = ".geometry_gate."  # in the name of the gate's parameter
 _EVALUATION_STEP = -1  # evaluation loss draws the same noise at every training step, so that its curve is comparable
+
+
+class TrainingProgress(nn.Module):
+    """Optimiser steps done, kept in the checkpoint: noise is keyed by them (see model/flow.py).
+
+    A module, so that PEFT can save it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.step: Tensor
+        self.register_buffer("step", torch.zeros((), dtype=torch.int64))
 
 
 class PI05GeometryPolicy(PreTrainedPolicy):
@@ -79,8 +96,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self._set_trainable()
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
-        # Optimiser steps done, kept in the checkpoint: noise is keyed by it (see model/flow.py).
-        self.register_buffer("training_step", torch.zeros((), dtype=torch.int64))
+        self.progress = TrainingProgress()
         self._noise_seed = torch.initial_seed()
         self._last_update: dict[str, Tensor] = {}
         if not self.model.action_in_proj.weight.is_meta:  # from_pretrained fills the weights first
@@ -215,6 +231,21 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         policy.eval()
         return policy
 
+    @property
+    def training_step(self) -> Tensor:
+        """Optimiser steps done, a scalar on the policy's device."""
+        return self.progress.step
+
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        """LeRobot asks here what `--peft.*` trains."""
+        return peft_targets(self.config)
+
+    def _validate_peft_config(self, peft_config: Any) -> None:
+        """LeRobot asks here about a PEFT configuration before it uses it; the new parameters are always trained."""
+        super()._validate_peft_config(peft_config)
+        given = list(peft_config.modules_to_save or [])
+        peft_config.modules_to_save = given + [name for name in always_in_full(self.config) if name not in given]
+
     # --- training -------------------------------------------------------------------------------------------------
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
@@ -226,39 +257,65 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction must be 'mean' or 'none', got {reduction!r}.")
         device = self.training_step.device
+        size, steps = batch[ACTION].shape[:2]
+        draw = self._draw(batch, torch.Size((size, steps, self.config.max_action_dim)))
+        is_pad = batch.get("action_is_pad")
+        valid = torch.ones(size, steps, dtype=torch.bool, device=device) if is_pad is None else ~is_pad  # (B, S)
+        action_dim = self.config.action_feature.shape[0]
+        seen: list[Tensor] = []
+
+        def part(rows: slice) -> Tensor:
+            """Share of some rows in the mean of all, or their losses one by one."""
+            flow = FlowDraw(*(drawn[rows] for drawn in draw))
+            losses = self._losses(rows_of(batch, size, rows), flow)[..., :action_dim]
+            losses = losses.masked_fill(~valid[rows][..., None], 0.0)
+            seen.append(losses.detach())
+            if reduction == "none":
+                return losses.sum(dim=(1, 2)) / (valid[rows].sum(dim=1) * action_dim)
+            return losses.sum() / (valid.sum() * action_dim)
+
+        loss = self._in_micro_batches(part, size, reduction)
+        losses = torch.cat(seen)  # (B, S, action_dim)
+        info: dict[str, Any] = {"loss": (losses.sum() / (valid.sum() * action_dim)).item()}
+        info["loss_per_dim"] = (losses.sum(dim=(0, 1)) / valid.sum()).tolist()
+        gate = self.model.paligemma_with_expert.geometry_gate
+        if gate is not None:
+            info["gate_openness"] = gate.openness()
+        info.update({name: value.item() for name, value in self._last_update.items()})
+        return loss, info
+
+    def _in_micro_batches(self, part: Callable[[slice], Tensor], size: int, reduction: str) -> Tensor:
+        """The sum of `part` over the rows of a batch, or its values put together, `micro_batch_size` rows at a time."""
+        step = self.config.micro_batch_size or size
+        parts = [partial(part, slice(start, start + step)) for start in range(0, size, step)]
+        if len(parts) == 1:
+            return parts[0]()
+        parameters = [p for p in self.parameters() if p.requires_grad]
+        if torch.is_grad_enabled() and parameters:
+            require_whole_parameters(self)
+            return (each_of if reduction == "none" else sum_of)(parts, parameters)
+        losses = [run() for run in parts]
+        return torch.cat(losses) if reduction == "none" else torch.stack(losses).sum()
+
+    def _losses(self, batch: dict[str, Any], draw: FlowDraw) -> Tensor:
+        """Loss of every action entry (B, S, max_action_dim), the mean over flow samples."""
+        device = self.training_step.device
         images, img_masks = prepare_images(batch, self.config, device)
-        actions = pad_vector(batch[ACTION], self.config.max_action_dim).float()
-        draw = self._draw(batch, actions.shape)
         embs, pad = self._geometry_tokens(batch)
         if pad is not None and self.training:
             pad = pad & (draw.dropout.to(device) >= self.config.geometry_dropout)[:, None]
-        losses = self.model(
+        losses: Tensor = self.model(
             images,
             img_masks,
             batch[OBS_LANGUAGE_TOKENS],
             batch[OBS_LANGUAGE_ATTENTION_MASK],
-            actions,
+            pad_vector(batch[ACTION], self.config.max_action_dim).float(),
             draw.noise.to(device),
             draw.time.to(device),
             embs,
             pad,
         )
-        action_dim = self.config.action_feature.shape[0]
-        losses = losses[..., :action_dim]  # (B, S, action_dim), with K before S for several flow samples
-        if losses.ndim == 4:
-            losses = losses.mean(dim=1)
-        is_pad = batch.get("action_is_pad")
-        valid = torch.ones(losses.shape[:2], dtype=torch.bool, device=device) if is_pad is None else ~is_pad  # (B, S)
-        losses = losses.masked_fill(~valid[..., None], 0.0)
-        per_sample = losses.sum(dim=(1, 2)) / (valid.sum(dim=1) * action_dim)
-        mean = losses.sum() / (valid.sum() * action_dim)
-        info: dict[str, Any] = {"loss": mean.item()}
-        info["loss_per_dim"] = (losses.detach().sum(dim=(0, 1)) / valid.sum()).tolist()
-        gate = self.model.paligemma_with_expert.geometry_gate
-        if gate is not None:
-            info["gate_openness"] = gate.openness()
-        info.update({name: value.item() for name, value in self._last_update.items()})
-        return (per_sample if reduction == "none" else mean), info
+        return losses.mean(dim=1) if losses.ndim == 4 else losses
 
     def _draw(self, batch: dict[str, Tensor], shape: torch.Size) -> FlowDraw:
         """Noise, flow time and dropout draw, keyed by (seed, step, dataset index); by the row where there is no index."""
@@ -290,15 +347,18 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         ]
         gate = [p for name, p in new.items() if GATE in name]
         rest = [p for name, p in new.items() if GATE not in name]
+        common: dict[str, Any] = {"eps": self.config.geometry_eps, "weight_decay": 0.0}
+        if self.config.optimizer == "adamw8bit":
+            common[FULL_STATE] = True
         for params, lr in ((rest, self.config.geometry_lr), (gate, self.config.geometry_gate_lr)):
             if params:
-                groups.append({"params": params, "lr": lr, "eps": self.config.geometry_eps, "weight_decay": 0.0})
+                groups.append({"params": params, "lr": lr, **common})
         return groups
 
     @torch.no_grad()
     def update(self) -> None:
         """LeRobot calls this after every optimiser step: count it, and measure how far the new parameters moved."""
-        self.training_step += 1
+        self.training_step.add_(1)
         now = [p.detach().clone() for p in self.new_parameters().values() if p.requires_grad]
         before = getattr(self, "_previous", None)
         self._previous = now

@@ -68,7 +68,7 @@ def assert_same_weights(folder: Path) -> None:
         if "lm_head" not in name:
             assert found[name].dtype == tensor.dtype
             assert torch.equal(found.pop(name), tensor), name
-    assert all(name == "training_step" or "geometry" in name for name in found)
+    assert all(name == "progress.step" or "geometry" in name for name in found)
 
 
 @pytest.mark.parametrize("change", VARIANTS, ids=lambda change: change.__name__)
@@ -107,7 +107,7 @@ def test_dtypes_stay_as_they_are_stored(tmp_path):
     convert(source, tmp_path / "output", GeometryStart(source="none"))
     before, after = load_file(source / WEIGHTS), load_file(tmp_path / "output" / WEIGHTS)
     assert {t.dtype for t in after.values()} > {torch.float64, torch.bfloat16, torch.float16}
-    for name in after.keys() - {"training_step"}:
+    for name in after.keys() - {"progress.step"}:
         assert after[name].dtype == before[name].dtype
         assert torch.equal(after[name], before[name])
 

@@ -13,7 +13,7 @@ from .tensor_file import StoredTensor
 _NETWORK = f"{PREFIX}paligemma_with_expert."
 _GATE, _ADAPTER, _OWN_EXPERT = f"{_NETWORK}geometry_gate.", "geometry.adapter.", f"{_NETWORK}geometry_expert."
 _EXPERT = f"{_NETWORK}gemma_expert.model."
-_STEP = "training_step"
+_STEP = "progress.step"
 
 
 def is_new(name: str) -> bool:
