@@ -175,5 +175,8 @@ def test_log_lines_are_read_as_lerobot_writes_them(tmp_path):
     assert read_log_line(line.format("1K")) == {"step": 1000, "loss": 2.063}
     assert read_log_line("INFO 2026-01-01 10:00:00 ot_train.py:687 Checkpoint policy after step 2") is None
     log = tmp_path / "run.log"
-    log.write_text("\n".join(line.format(step) for step in (1, 2, 3, 1, 2)))
-    assert read_curve(log)["step"] == [1, 2]  # the last start alone
+    log.write_text("\n".join(line.format(step) for step in (25, 50, 75, 25, 50)))
+    assert read_curve(log, 25)["step"] == [25, 50]  # the last start alone
+    rounded = [str(step) if step < 1000 else f"{step / 1000:.0f}K" for step in range(25, 1525, 25)]
+    log.write_text("\n".join(map(line.format, rounded)))
+    assert read_curve(log, 25)["step"] == list(range(25, 1525, 25))  # although LeRobot writes 1K, 1K, ... 2K

@@ -95,7 +95,7 @@ class HeldOutRun(Run):
                 "dataset.eval_split": self.held_out,
                 "steps": self.training_steps,
                 "save_freq": self.training_steps,
-                "log_freq": max(1, self.training_steps // 60),
+                "log_freq": self.log_every,
                 "seed": self.seed,
                 "output_dir": output,
             }

@@ -59,7 +59,11 @@ def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str
     bands = {arm: _bands(errors[arm, ALL_CAMERAS]) for arm in arms}
     caption = "Error of the action so many steps ahead, mean and interval."
     page.row(picture(horizon_figure(bands), caption, pictures / "horizon.png"))
-    curves = {run.arm_name: read_curve(run.log) for run in runs if run.seed == runs[0].seed and not run.crash.exists()}
+    curves = {
+        run.arm_name: read_curve(run.log, run.log_every)
+        for run in runs
+        if run.seed == runs[0].seed and not run.crash.exists()
+    }
     page.row(picture(curves_figure(curves), "Loss on training batches, first seed.", pictures / "curves.png"))
     page.heading("Again")
     page.code(command)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from .runs import Run
-from .training_log import read_log_line
+from .training_log import TrainingCurve
 from .worker import PROGRESS
 
 _EVALUATION_COST = 2.5  # of an episode or frame, beside a step of training, for the estimate of the time left
@@ -29,6 +29,7 @@ class Job:
     run: Run
     process: subprocess.Popen
     log_position: int
+    curve: TrainingCurve
     stage: str = "start"
     done: int = 0
     total: int = 0
@@ -41,9 +42,8 @@ class Job:
         complete = text[: text.rfind("\n") + 1]
         self.log_position += len(complete.encode())
         for line in complete.splitlines():
-            step = read_log_line(line)
-            if step is not None:
-                self.stage, self.done, self.total = "train", step["step"], self.run.steps
+            if self.curve.add(line):
+                self.stage, self.done, self.total = "train", self.curve.steps[-1], self.run.steps
             elif PROGRESS in line:
                 stage, _, count = line.split(PROGRESS)[1].strip().rpartition(" ")
                 self.stage = stage
@@ -116,7 +116,7 @@ def _start(run: Run, threads: int) -> Job:
         position = log.tell()
         command = [sys.executable, "-m", "lerobot_policy_pi05_geometry.study.worker", str(description)]
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
-    return Job(run, process, position)
+    return Job(run, process, position, TrainingCurve(run.log_every))
 
 
 def _note_crash(job: Job) -> None:

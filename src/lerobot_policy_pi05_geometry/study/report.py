@@ -155,7 +155,7 @@ def _inside(page: Page, runs: Sequence[SimulatedRun], pictures: Path) -> None:
         )
     same = [run for run in trained if (run.task, run.seed) == (trained[0].task, trained[0].seed)] if trained else []
     if same:
-        curves = {run.arm_name: read_curve(run.log) for run in same}
+        curves = {run.arm_name: read_curve(run.log, run.log_every) for run in same}
         page.row(picture(curves_figure(curves), "Loss on training batches, first seed.", pictures / "curves.png"))
 
 

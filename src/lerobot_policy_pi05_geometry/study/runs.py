@@ -74,6 +74,11 @@ class Run(ABC):
         """Evaluate the checkpoint and write the outcome."""
 
     @property
+    def log_every(self) -> int:
+        """Steps between two lines of the training log."""
+        return max(1, self.steps // 60)
+
+    @property
     def arm(self) -> Arm:
         return find_arm(self.arm_name)
 

@@ -113,7 +113,7 @@ class SimulatedRun(Run):
             "batch_size": budget.batch_size,
             "steps": budget.steps,
             "num_workers": 0,
-            "log_freq": max(1, budget.steps // 60),
+            "log_freq": self.log_every,
             "save_freq": budget.steps,
             "seed": self.seed,
             "output_dir": output,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 
 def read_log_line(line: str) -> dict | None:
-    """Step and loss of a line of LeRobot's training log; None for any other line."""
+    """Step (as LeRobot rounds it) and loss of a line of LeRobot's training log; None for any other line."""
     if " step:" not in line or " loss:" not in line:
         return None
     fields = dict(entry.split(":", 1) for entry in line.split(" step:", 1)[1].split()[1:] if ":" in entry)
@@ -13,15 +13,33 @@ def read_log_line(line: str) -> dict | None:
     return {"step": int(float(digits.rstrip("KM")) * scale), "loss": float(fields["loss"])}
 
 
-def read_curve(log: Path) -> dict[str, list[float]]:
-    """Training loss of a run, from its log; of its last start, if it was started more than once."""
-    curve: dict[str, list[float]] = {"step": [], "loss": []}
-    for line in log.read_text().splitlines():
+class TrainingCurve:
+    """Steps and losses of a training, from its log lines; of its last start, if it was started more than once.
+
+    every: steps between two lines. LeRobot rounds steps from 1,000 on ("1K"), so they are counted and not read.
+    """
+
+    def __init__(self, every: int) -> None:
+        self._every, self._rounded = every, 0
+        self.steps: list[int] = []
+        self.losses: list[float] = []
+
+    def add(self, line: str) -> bool:
+        """Take note of a line; whether it was one of the training's."""
         point = read_log_line(line)
         if point is None:
-            continue
-        if curve["step"] and point["step"] < curve["step"][-1]:
-            curve = {"step": [], "loss": []}
-        for name, values in curve.items():
-            values.append(point[name])
-    return curve
+            return False
+        if point["step"] < self._rounded:
+            self.steps, self.losses = [], []
+        self._rounded = point["step"]
+        self.steps.append(self._every * (len(self.steps) + 1))
+        self.losses.append(point["loss"])
+        return True
+
+
+def read_curve(log: Path, every: int) -> dict[str, list]:
+    """Training loss of a run, from its log with a line every so many steps."""
+    curve = TrainingCurve(every)
+    for line in log.read_text().splitlines():
+        curve.add(line)
+    return {"step": curve.steps, "loss": curve.losses}
