@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from torch.utils.data import default_collate
 from ..geometry.keys import DEPTH_SUFFIX, depth_key
 from ..loading import LoadedPolicy, load_policy
 from .arms import find_arm
-from .runs import Run, Say, option_list
+from .runs import Run, Say, option_list, versions
 from .training import train_with
 
 ALL_CAMERAS, NO_DEPTH, ONLY = "all-cameras", "no-depth", "only-"
@@ -53,7 +53,7 @@ class HeldOutRun(Run):
     def steps(self) -> int:
         return self.training_steps
 
-    @property
+    @cached_property
     def evaluation_size(self) -> int:
         episodes = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).total_episodes
         return self.frames * math.ceil(self.held_out * episodes)
@@ -64,7 +64,7 @@ class HeldOutRun(Run):
             "arm": self.arm_name,
             "arguments": self.arguments(Path("output")),
             "dataset": [(meta / name).read_text() for name in ("info.json", "stats.json")],
-            "versions": {name: version(name) for name in ("lerobot_policy_pi05_geometry", "lerobot", "torch")},
+            "versions": versions("lerobot_policy_pi05_geometry", "lerobot", "torch"),
         }
 
     def evaluation_description(self, condition: str) -> dict[str, Any]:

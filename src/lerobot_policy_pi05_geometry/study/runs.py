@@ -17,6 +17,8 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cache, cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -82,8 +84,9 @@ class Run(ABC):
     def arm(self) -> Arm:
         return find_arm(self.arm_name)
 
-    @property
+    @cached_property
     def folder(self) -> Path:
+        # Kept, since a launcher asks all the time, and what the hash is made of takes time to read.
         return self.root / "runs" / f"{self.name}-{short_hash(self.description())}"
 
     @property
@@ -110,6 +113,12 @@ class Run(ABC):
     def to_json(self) -> str:
         """Everything a worker needs."""
         return json.dumps({"kind": type(self).__name__, **asdict(self)}, default=str)
+
+
+@cache
+def versions(*packages: str) -> dict[str, str]:
+    """What a result also depends on."""
+    return {name: version(name) for name in packages}
 
 
 def short_hash(content: dict[str, Any]) -> str:

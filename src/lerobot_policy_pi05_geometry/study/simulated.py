@@ -1,7 +1,6 @@
 """A run in the simulator: the same expert episodes for every arm, success on the same unseen seeds."""
 
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from ..sim.sensor import SENSORS
 from ..sim.tasks import find_task
 from .conditions import counts_as, find_condition
 from .locks import alone
-from .runs import Run, Say, option_list, short_hash
+from .runs import Run, Say, option_list, short_hash, versions
 from .spec import Budget, StudySpec
 from .training import train_with
 
@@ -48,7 +47,7 @@ class SimulatedRun(Run):
             "cameras": asdict(CAMERA_RANGES[self.arm.cameras]),
             "episodes": self.budget.episodes,
             "image_size": self.budget.image_size,
-            "versions": {name: version(name) for name in _PACKAGES},
+            "versions": versions(*_PACKAGES),
         }
 
     def description(self) -> dict[str, Any]:
