@@ -106,10 +106,9 @@ def floor(args: argparse.Namespace, cameras: int, ours: PI05Pytorch) -> dict[str
 
     def need(module: torch.nn.Module, tokens: int) -> float:
         numbers = sum(p.numel() for p in module.parameters() if p.ndim > 1)
-        block = torch.ones(
-            numbers, device=device, dtype=dtype
-        )  # as large as the weights: it may fit a cache, as they may
-        copying = min(seconds(block.clone, device) for _ in range(5))
+        # As large as the weights, since what fits a cache is read faster; but of no more than 1 GB in bfloat16.
+        block = torch.ones(min(numbers, 2**29), device=device, dtype=dtype)
+        copying = min(seconds(block.clone, device) for _ in range(5)) * numbers / block.numel()
         return max(2 * numbers * tokens / rate, copying / 2)  # a copy reads and writes
 
     steps, expert = ours.config.num_inference_steps, network.expert.layers
