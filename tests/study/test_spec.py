@@ -40,13 +40,34 @@ def test_every_study_that_comes_along_can_be_read(name):
     assert read_spec(name).comparisons
 
 
-def test_the_default_study_is_the_one_that_was_promised():
+def test_the_default_study_is_the_one_that_was_promised(tmp_path):
+    """Every arm on one task, the rivals on two more, under every condition that concerns them."""
     spec = read_spec("default")
     assert len(spec.seeds) >= 3
     assert spec.budget.evaluation_episodes >= 50
-    assert set(spec.comparisons[0].arms) == set(ARMS)
-    assert len({task for comparison in spec.comparisons for task in comparison.tasks}) >= 3
-    assert {"inside", "outside", "noise", "depth-off"} <= set(spec.comparisons[0].conditions)
+    conditions = {(run.task, run.arm_name): set(run.conditions) for run in runs_of(spec, tmp_path)}
+    arms = {task: {arm for t, arm in conditions if t == task} for task, _ in conditions}
+    assert max(arms.values(), key=len) == set(ARMS)
+    assert len(arms) >= 3
+    for task, on_task in arms.items():
+        assert {"blind", "rgb", "rgb-wide", "geometry"} <= on_task
+        assert conditions[task, "geometry"] == set(CONDITIONS) - {"far"}
+        assert all({"inside", "outside"} <= conditions[task, arm] for arm in on_task)
+
+
+def test_what_several_blocks_ask_of_an_arm_adds_up(tmp_path):
+    text = (
+        SPEC
+        + '[[compare]]\ntasks = ["button-press-topdown-wide"]\narms = ["geometry", "blind"]\nconditions = ["far", "inside"]\n'
+    )
+    runs = [run for run in runs_of(read_spec(write(tmp_path, text)), tmp_path) if run.seed == 3]
+    asked = [(run.arm_name, run.conditions) for run in runs]
+    own = runs_of(read_spec(write(tmp_path, SPEC)), tmp_path)[0].conditions
+    assert asked == [
+        ("rgb", own),
+        ("geometry", (*own, *(c for c in ("far", "inside") if c not in own))),
+        ("blind", ("far", "inside")),
+    ]
 
 
 @pytest.mark.parametrize(

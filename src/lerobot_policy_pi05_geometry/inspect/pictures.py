@@ -109,17 +109,27 @@ def segment_share_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]
     return figure
 
 
-def success_figure(conditions: Sequence[str], arms: Mapping[str, Sequence[tuple[float, float, float]]]) -> Figure:
-    """Success rates with intervals, one panel per condition. arms: per arm one (rate, low, high) per condition."""
+def success_figure(
+    conditions: Sequence[str], arms: Mapping[str, Sequence[tuple[float, float, float] | None]]
+) -> Figure:
+    """Success rates with intervals, one panel per condition.
+
+    arms: per arm one (rate, low, high) per condition, None where it was not evaluated.
+    """
     columns = min(len(conditions), 4)
     rows = -(-len(conditions) // columns)
     size = (1.6 + 2.9 * columns, rows * (0.9 + 0.36 * len(arms)))
     figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False).flat
+    panels = list(figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False).flat)
     y = np.arange(len(arms))[::-1]
-    for axes, condition, i in zip(panels, conditions, range(len(conditions)), strict=False):
+    for i, condition in enumerate(conditions):
+        axes = panels[i]
         for yi, (arm, values) in zip(y, arms.items(), strict=True):
-            rate, low, high = values[i]
+            value = values[i]
+            if value is None:
+                axes.text(0.02, yi, "not evaluated", va="center", color=OTHER, fontsize=8)
+                continue
+            rate, low, high = value
             axes.barh(yi, rate, 0.62, color=COLOURS.get(arm, OTHER))
             axes.plot([low, high], [yi, yi], color=INK, linewidth=1.4)
             axes.text(high + 0.02, yi, f"{rate:.0%}", va="center", color=INK, fontsize=9)
@@ -128,7 +138,7 @@ def success_figure(conditions: Sequence[str], arms: Mapping[str, Sequence[tuple[
         axes.set_xticks(np.linspace(0, 1, 3), [f"{v:.0%}" for v in np.linspace(0, 1, 3)])
         axes.set_yticks(y, list(arms))
         axes.spines[["top", "right"]].set_visible(False)
-    for axes in list(panels)[len(conditions) :]:
+    for axes in panels[len(conditions) :]:
         axes.set_visible(False)
     figure.supxlabel("episodes that succeed, with 95 % intervals", fontsize=10)
     return figure

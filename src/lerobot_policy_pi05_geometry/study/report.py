@@ -67,8 +67,22 @@ def answer(table: pd.DataFrame) -> str:
         "With the camera outside the range it was trained on, the policy with geometry succeeds in "
         f"{_cell(geometry)} of episodes and RGB only in {_cell(rgb)}: {verdict}."
     )
-    controls = [f"{_NAMES[arm]} {arms[arm].rate:.0%}" for arm in _NAMES if arm in arms]
+    controls = [_control(name, rows, arm) for arm, name in _NAMES.items() if arm in arms]
     return text + (f" For comparison: {', '.join(controls)}." if controls else "")
+
+
+def _control(name: str, rows: pd.DataFrame, arm: str) -> str:
+    """A rate beside geometry's; where the arm ran on some tasks only, beside geometry's on these."""
+    tasks = rows.loc[rows["arm"] == arm, "task"].unique()
+    there = rows[rows["task"].isin(tasks)]
+    text = f"{name} {_rate(there, arm):.0%}"
+    if len(tasks) < rows["task"].nunique():
+        text += f" (on {', '.join(tasks)}, where geometry has {_rate(there, 'geometry'):.0%})"
+    return text
+
+
+def _rate(rows: pd.DataFrame, arm: str) -> float:
+    return float(rows.loc[rows["arm"] == arm, "success"].mean())
 
 
 _NAMES = {"rgb-wide": "RGB trained on the wide camera range", "random": "random tokens", "blind": "no camera at all"}
@@ -98,7 +112,7 @@ def _task(
     conditions = [name for name in CONDITIONS if any(cell.condition == name for cell in found)]
     arms = [name for name in ARMS if any(cell.arm == name for cell in found)]
     by_place = {(cell.arm, cell.condition): cell for cell in found}
-    bars = {arm: [_bar(by_place[arm, condition]) for condition in conditions] for arm in arms}
+    bars = {arm: [_bar(by_place.get((arm, condition))) for condition in conditions] for arm in arms}
     titles = [CONDITIONS[condition].title for condition in conditions]
     caption = "Success per arm and condition, over all training seeds."
     page.row(picture(success_figure(titles, bars), caption, pictures / f"success_{task}.png"))
@@ -106,7 +120,7 @@ def _task(
     page.table(
         ["arm", "what it is", "parameters", *titles],
         [
-            [arm, ARMS[arm].title, parameters.get(arm, "crashed"), *(_cell(by_place[arm, c]) for c in conditions)]
+            [arm, ARMS[arm].title, parameters.get(arm, "crashed"), *(_cell(by_place.get((arm, c))) for c in conditions)]
             for arm in arms
         ],
     )
@@ -118,7 +132,7 @@ def _task(
         by_pair = {(v.arm, v.condition): v for v in versus}
         page.table(
             ["geometry minus", *titles],
-            [[arm, *(_difference(by_pair[arm, c]) for c in conditions)] for arm in arms if arm != "geometry"],
+            [[arm, *(_difference(by_pair.get((arm, c))) for c in conditions)] for arm in arms if arm != "geometry"],
         )
     for condition in [c for c in ("inside", "outside") if c in conditions]:
         shown = [arm for arm in _SHOWN_IN_VIDEOS if arm in arms]
@@ -164,17 +178,24 @@ def _finished(runs: Sequence[SimulatedRun]) -> list[SimulatedRun]:
     return [run for run in runs if not run.crash.exists()]
 
 
-def _bar(cell: Cell) -> tuple[float, float, float]:
-    return (cell.rate, *cell.interval())
+_NOT_EVALUATED = "–"
 
 
-def _cell(cell: Cell) -> str:
+def _bar(cell: Cell | None) -> tuple[float, float, float] | None:
+    return None if cell is None else (cell.rate, *cell.interval())
+
+
+def _cell(cell: Cell | None) -> str:
+    if cell is None:
+        return _NOT_EVALUATED
     low, high = cell.interval()
     crashed = f", {cell.crashed_runs} crashed" if cell.crashed_runs else ""
     return f"{cell.rate:.0%} ({low:.0%} to {high:.0%}{crashed})"
 
 
-def _difference(versus: Versus) -> str:
+def _difference(versus: Versus | None) -> str:
+    if versus is None:
+        return _NOT_EVALUATED
     result = versus.result
     p = "p < 0.001" if versus.p < 0.001 else f"p = {versus.p:.2g}"
     return f"{100 * result.difference:+.0f} ({100 * result.low:+.0f} to {100 * result.high:+.0f}), {p}"

@@ -23,7 +23,7 @@ def episodes_table(runs: Sequence[SimulatedRun]) -> pd.DataFrame:
     """
     rows = []
     for run in runs:
-        for condition in dict.fromkeys(run.conditions):
+        for condition in run.conditions:
             evaluation = run.evaluation(condition)
             crashed = evaluation is None and run.crash.exists()
             if evaluation is None and not crashed:

@@ -1,5 +1,6 @@
 """A run in the simulator: the same expert episodes for every arm, success on the same unseen seeds."""
 
+import itertools
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -135,13 +136,18 @@ class SimulatedRun(Run):
 
 
 def runs_of(spec: StudySpec, root: Path) -> list[SimulatedRun]:
-    """Every run of a study, seed by seed, so that a study that was cut off has whole seeds."""
+    """Every run of a study once, seed by seed, so that a study that was cut off has whole seeds.
+
+    An arm that several blocks name for a task is one run, under the conditions of all of them.
+    """
+    wanted: dict[tuple[str, str], dict[str, None]] = {}
+    for comparison in spec.comparisons:
+        for task, arm in itertools.product(comparison.tasks, comparison.arms):
+            wanted.setdefault((task, arm), {}).update(dict.fromkeys(comparison.conditions))
     return [
-        SimulatedRun(root.absolute(), arm, seed, comparison.conditions, task, spec.budget)
+        SimulatedRun(root.absolute(), arm, seed, tuple(conditions), task, spec.budget)
         for seed in spec.seeds
-        for comparison in spec.comparisons
-        for task in comparison.tasks
-        for arm in comparison.arms
+        for (task, arm), conditions in wanted.items()
     ]
 
 

@@ -5,7 +5,7 @@ seeds = [0, 1, 2]
 [budget]                        # any field of `Budget`; what is left out keeps its default
 steps = 1500
 
-[[compare]]                     # one block per set of tasks
+[[compare]]                     # as many blocks as you like; what two of them ask of the same arm adds up
 tasks = ["button-press-topdown-wide"]
 arms = ["blind", "rgb", "geometry"]
 conditions = ["inside", "outside"]

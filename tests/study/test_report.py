@@ -1,0 +1,53 @@
+"""The sentence that a study's report begins with."""
+
+import pandas as pd
+
+from lerobot_policy_pi05_geometry.study.report import answer
+
+
+def table(rates: dict[tuple[str, str], int], condition: str = "outside") -> pd.DataFrame:
+    """Ten episodes of two seeds each; rates: (task, arm) -> how many of ten succeed."""
+    rows = [
+        (task, arm, seed, condition, episode, episode < wins, 1, False)
+        for (task, arm), wins in rates.items()
+        for seed in (0, 1)
+        for episode in range(10)
+    ]
+    columns = ["task", "arm", "training_seed", "condition", "episode_seed", "success", "steps", "crashed"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def test_an_arm_on_some_tasks_is_set_beside_geometry_on_these():
+    """Pooled over all tasks, a control that ran on the hard one only would look worse than it is."""
+    found = answer(
+        table(
+            {
+                ("hard", "geometry"): 2,
+                ("easy", "geometry"): 10,
+                ("hard", "rgb"): 1,
+                ("easy", "rgb"): 5,
+                ("hard", "random"): 1,
+                ("hard", "blind"): 0,
+                ("easy", "blind"): 4,
+            }
+        )
+    )
+    assert "geometry succeeds in 60% (" in found
+    assert "RGB only in 30% (" in found
+    assert "random tokens 10% (on hard, where geometry has 20%)" in found
+    assert "no camera at all 20%" in found
+    assert "no camera at all 20% (on" not in found
+
+
+def test_overlap_and_its_absence_are_said():
+    def said(geometry: int, rgb: int) -> str:
+        return answer(table({("t", "geometry"): geometry, ("t", "rgb"): rgb}))
+
+    assert "the intervals do not overlap" in said(9, 1)
+    assert "the intervals do not overlap" in said(1, 9)
+    assert "the intervals overlap" in said(5, 4)
+
+
+def test_without_the_camera_moved_the_best_cell_is_named():
+    found = answer(table({("t", "geometry"): 3, ("t", "rgb"): 7}, condition="inside"))
+    assert "The best cell of this study is rgb under 'inside': 70%" in found
