@@ -176,11 +176,13 @@ def test_weights_that_changed_after_building_act(change, dtype: torch.dtype) -> 
     assert torch.allclose(after, fast(fresh, batch), atol=1e-6)
 
 
-def test_a_network_that_has_run_still_trains() -> None:
-    """Gradients of joined weights are those of single ones."""
+@pytest.mark.parametrize("acting", [torch.no_grad, torch.inference_mode])
+def test_a_network_that_has_run_still_trains(acting) -> None:
+    """Gradients of joined weights are those of single ones. LeRobot's evaluation in training acts in inference mode."""
     joined, single = (build_network(SEGMENT, seed=61) for _ in range(2))
     batch = draw(joined, Case(seed=8, batch=2))
-    fast(ChunkRunner(joined), batch)
+    with acting():
+        fast(ChunkRunner(joined), batch)
     for network in (joined, single):
         network(*batch).mean().backward()
     for (name, a), (_, b) in zip(joined.named_parameters(), single.named_parameters(), strict=True):

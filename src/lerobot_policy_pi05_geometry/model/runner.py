@@ -71,6 +71,7 @@ class ChunkRunner:
         if self._weights.stale():
             self._build()
 
+    @torch.inference_mode(False)  # or the joined weights could never again be trained
     @torch.no_grad()
     def _build(self) -> None:
         """Everything that depends on the weights alone."""
