@@ -9,8 +9,10 @@ from hypothesis import given, settings
 from torch import Tensor, nn
 
 from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, PI05Pytorch
+from lerobot_policy_pi05_geometry.model.config import RunnerName
 from lerobot_policy_pi05_geometry.model.runner import ChunkRunner
 from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
+from lerobot_policy_pi05_geometry.model.side_stream import GeometryTokens, PendingGeometry
 from tests.model.helpers import (
     EVERY_GEOMETRY,
     IN_PREFIX,
@@ -228,6 +230,44 @@ def test_what_the_runner_does_not_do_is_done_by_the_plain_path() -> None:
     plain = fast(ChunkSampler(network), batch, use_cache=False)
     assert torch.equal(plain, sample(network, batch, num_steps=3, use_cache=False))
     assert torch.equal(fast(ChunkSampler(network), batch, runner="plain"), sample(network, batch, num_steps=3))
+
+
+@pytest.mark.parametrize("geometry", [None, SEGMENT, IN_PREFIX], ids=name_of)
+@pytest.mark.parametrize("runner", ["fast", "eager", "plain"])
+def test_explain_says_what_a_chunk_did(geometry: GeometrySegmentConfig | None, runner: RunnerName) -> None:
+    said = ChunkSampler(build_network(geometry, seed=83).eval()).explain(runner)
+    if runner == "plain":
+        assert said == {"runner": "declined: inference_runner=plain; the plain path serves"}
+        return
+    assert said["runner"] == "active"
+    assert said["CUDA graphs"] == "declined: a cpu has none"
+    before = {None: "none", SEGMENT: "measured after the prefix", IN_PREFIX: "measured before the prefix"}[geometry]
+    assert said["geometry"].startswith(before)
+
+
+@pytest.mark.parametrize("runner", ["fast", "plain"])
+def test_pending_geometry_is_measured_once_whoever_computes(runner: RunnerName) -> None:
+    network = build_network(SEGMENT, seed=84).eval()
+    batch, times = draw(network, Case(seed=12)), []
+
+    def measure() -> GeometryTokens:
+        times.append(1)
+        return GeometryTokens(batch.geom_embs, batch.geom_pad)
+
+    pending = PendingGeometry(batch.geom_embs.shape[1], measure)
+    found = ChunkSampler(network)(*batch.observation, noise=batch.noise, num_steps=3, geometry=pending, runner=runner)
+    assert torch.equal(found, fast(ChunkSampler(network), batch, runner=runner))
+    assert len(times) == 1
+
+
+def test_a_copied_sampler_follows_the_copied_network() -> None:
+    network = build_network(SEGMENT, seed=85).eval()
+    sampler, batch = ChunkSampler(network), draw(network, Case(seed=13))
+    before = fast(sampler, batch)
+    other_network, other = copy.deepcopy((network, sampler))
+    randomise(other_network, 86)
+    assert not torch.allclose(fast(other, batch), before, atol=1e-3)
+    assert torch.equal(fast(sampler, batch), before)
 
 
 def test_a_runner_of_another_seed_is_another_policy() -> None:

@@ -33,6 +33,8 @@ class SegmentTokens(NamedTuple):
 
     def followed_by(self, other: "SegmentTokens") -> "SegmentTokens":
         """Both as one segment that is one block, in this one's dtype."""
+        assert self.embs is not None
+        assert other.embs is not None
         embs = torch.cat([self.embs, other.embs.to(self.embs.dtype)], dim=1)
         return SegmentTokens(embs, torch.cat([self.pad, other.pad], dim=1), [0] * embs.shape[1])
 

@@ -164,9 +164,7 @@ class ChunkRunner:
 
     def act(self, context: Context, noise: Tensor, geometry: GeometryTokens | None, num_steps: int) -> Tensor:
         """Actions (B, S, D) from noise of that shape; geometry is None if there is none or the prefix has it."""
-        if geometry is not None:
-            self.prefill_geometry(context, geometry)
-        return self.denoise(context, noise, None if geometry is None else geometry.pad, num_steps)
+        return self.denoise(context, noise, self.prefill_geometry(context, geometry), num_steps)
 
     def embed(self, observation: Observation, geometry: GeometryTokens | None = None) -> SegmentTokens:
         """Vision and text, and the geometry that belongs into the prefix."""
@@ -183,12 +181,15 @@ class ChunkRunner:
         self._run(Segment.PREFIX, prefix.embs, frame, cache, None, output=False)
         return Context(prefix.pad, cache)
 
-    def prefill_geometry(self, context: Context, geometry: GeometryTokens) -> None:
-        """Keys and values of geometry into the cache."""
+    def prefill_geometry(self, context: Context, geometry: GeometryTokens | None) -> Tensor | None:
+        """Keys and values of geometry, if there is any, into the cache. Returns its mask."""
+        if geometry is None:
+            return None
         segment = self.network.embed_geometry(*geometry)
         assert segment.embs is not None
         frame = self._frame([context.prefix_pad, segment.pad, None], Segment.GEOMETRY)
         self._run(Segment.GEOMETRY, segment.embs, frame, context.cache, self._clean, output=False)
+        return segment.pad
 
     def denoise(self, context: Context, x_t: Tensor, geometry_pad: Tensor | None, num_steps: int) -> Tensor:
         """Integrate the flow from noise x_t (B, S, D) over a filled cache."""

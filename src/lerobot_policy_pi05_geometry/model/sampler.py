@@ -1,11 +1,12 @@
 """Which way a chunk is computed: by the runner, or by the plain path where the runner is not wanted or does not apply."""
 
 import logging
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from .config import RunnerName
 from .graphs import PROMPT_STEP, GraphRunner
 from .pi05 import PI05Pytorch
 from .runner import ChunkRunner, why_not
@@ -13,9 +14,6 @@ from .side_stream import PendingGeometry
 
 logger = logging.getLogger(__name__)
 
-RunnerName = Literal[
-    "fast", "eager", "plain"
-]  # the runner, on a GPU as graphs; the runner without graphs; the reference
 _KNOWN_TO_RUNNER = {"noise", "num_steps", "geom_embs", "geom_pad", "geometry"}
 
 
@@ -120,5 +118,5 @@ class ChunkSampler:
         if isinstance(active, GraphRunner):
             state = f"active: {len(active.recorded)} of at most {active.capacity} shapes of inputs recorded"
             return {"CUDA graphs": state, "prompt": f"padded to a multiple of {PROMPT_STEP} tokens, one graph each"}
-        why = "inference_runner=eager" if self._device.type == "cuda" else f"none on a {self._device.type}"
+        why = "inference_runner=eager" if self._device.type == "cuda" else f"a {self._device.type} has none"
         return {"CUDA graphs": f"declined: {why}", "prompt": "as long as the longest of the batch"}
