@@ -265,6 +265,7 @@ def test_a_copied_sampler_follows_the_copied_network() -> None:
     sampler, batch = ChunkSampler(network), draw(network, Case(seed=13))
     before = fast(sampler, batch)
     other_network, other = copy.deepcopy((network, sampler))
+    assert not other._runners  # recorded graphs have no copies
     randomise(other_network, 86)
     assert not torch.allclose(fast(other, batch), before, atol=1e-3)
     assert torch.equal(fast(sampler, batch), before)
