@@ -96,9 +96,9 @@ class GraphRunner(ChunkRunner):
         self.recorded.clear()
         super()._build()
 
-    def __call__(self, images: Any, img_masks: Any, tokens: Tensor, masks: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+    def sample(self, images: Any, img_masks: Any, tokens: Tensor, masks: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         more = -tokens.shape[1] % PROMPT_STEP
-        return super().__call__(images, img_masks, F.pad(tokens, (0, more)), F.pad(masks, (0, more)), *args, **kwargs)
+        return super().sample(images, img_masks, F.pad(tokens, (0, more)), F.pad(masks, (0, more)), *args, **kwargs)
 
     def _chunk(self, observation: Observation, noise: Tensor, num_steps: int, num_tokens: int) -> Chunk:
         shapes = [(x.shape, x.dtype) if isinstance(x, Tensor) else None for x in tree_leaves((observation, noise))]

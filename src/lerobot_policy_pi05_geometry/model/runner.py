@@ -17,7 +17,7 @@ Shapes: B batch, N tokens of a segment, W width, H heads, KV key/value heads, D 
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -113,8 +113,13 @@ class ChunkRunner:
             self._steps[num_steps] = [self._modulations(self._models[Segment.SUFFIX], time) for time in times]
         return self._steps[num_steps]
 
+    def __call__(self, *observation: Any, **kwargs: Any) -> Tensor:
+        """An action chunk (B, S, D) float32 from the weights as they are now; arguments as in `sample`."""
+        self.refresh()
+        return self.sample(*observation, **kwargs)
+
     @torch.no_grad()
-    def __call__(
+    def sample(
         self,
         images: Sequence[Tensor | None],
         img_masks: Sequence[Tensor],
@@ -126,11 +131,10 @@ class ChunkRunner:
         geom_pad: Tensor | None = None,
         geometry: PendingGeometry | None = None,
     ) -> Tensor:
-        """An action chunk (B, S, D) float32; arguments as in `PI05Pytorch.sample_actions`.
+        """An action chunk from the weights as they were last looked at; arguments as in `PI05Pytorch.sample_actions`.
 
         geometry: instead of geom_embs and geom_pad, what measures them once vision and prefix are on their way.
         """
-        self.refresh()
         if noise is None:
             shape = (tokens.shape[0], self.config.chunk_size, self.config.max_action_dim)
             noise = torch.randn(shape, device=tokens.device)

@@ -30,7 +30,7 @@ class ChunkSampler:
         return ChunkSampler, (self._network,)
 
     def __call__(self, *observation: Any, runner: RunnerName = "fast", **kwargs: Any) -> Tensor:
-        """An action chunk (B, S, D); observation and kwargs as in `ChunkRunner.__call__` or `PI05Pytorch.sample_actions`."""
+        """An action chunk (B, S, D); observation and kwargs as in `ChunkRunner.sample` or `PI05Pytorch.sample_actions`."""
         given = {name: value for name, value in kwargs.items() if value is not None}
         if runner == "plain":
             return self._plainly(*observation, **given)
@@ -41,7 +41,7 @@ class ChunkSampler:
             self._declined = declined
             return self._plainly(*observation, **given)
         self._declined = None
-        return self._runners[self._class(runner)](*observation, **given)
+        return self._runners[self._class(runner)].sample(*observation, **given)
 
     def _plainly(self, *observation: Any, geometry: PendingGeometry | None = None, **given: Any) -> Tensor:
         if geometry is not None:
