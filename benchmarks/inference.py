@@ -2,7 +2,7 @@
 
     python -m benchmarks.inference --cameras 1 3                 small size, float32
     python -m benchmarks.inference --cameras 1 3 --full          released size, bfloat16, random weights (needs about 20 GB)
-    python -m benchmarks.inference --cameras 1 3 --full --device cuda --compiled --da3 base --output numbers.json --trace traces
+    python -m benchmarks.inference --cameras 1 3 --full --device cuda --compiled lerobot ours --da3 base --trace traces
 
 All arms run the same weights and observations in one process, in turn, round by round; a ratio is the median over rounds of
 an arm's time over eager LeRobot's in the same round. Ours is what a policy uses by default (the runner; on a GPU as CUDA graphs,
@@ -30,12 +30,30 @@ from lerobot_policy_pi05_geometry.geometry import GeometryEncoder
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS, Da3Backbone, Da3Encoder, Da3Source
 from lerobot_policy_pi05_geometry.geometry.da3.encoder import store_products_in
 from lerobot_policy_pi05_geometry.model import PI05Pytorch
+from lerobot_policy_pi05_geometry.model.fast_layers import run_layers
 from lerobot_policy_pi05_geometry.model.runner import ChunkRunner, Observation
 from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.model.side_stream import GeometryTokens, PendingGeometry
 
 EAGER, COMPILED, GEOMETRY, PLAIN = "lerobot", "lerobot compiled", "geometry", "no geometry"
-NO_GRAPHS, BESIDE, BEFORE = "geometry, no graphs", "da3 beside", "da3 before"
+NO_GRAPHS, OWN_COMPILED, BESIDE, BEFORE = "geometry, no graphs", "geometry, compiled", "da3 beside", "da3 before"
+PAIRS = {
+    "beside over before": (BESIDE, BEFORE),
+    "graphs over none": (GEOMETRY, NO_GRAPHS),
+    "compiled over not": (OWN_COMPILED, GEOMETRY),
+}
+
+
+class CompiledRunner(ChunkRunner):
+    """The runner with compiled layers, without graphs. Policies do not have it, since it did not pay (docs/results.md)."""
+
+    def _build(self) -> None:
+        super()._build()
+        self._compiled = torch.compile(run_layers, dynamic=False)
+
+    def _run(self, segment, embs, frame, cache, modulations, output):
+        x, layers = embs.to(self.config.dtype), self._layers[segment]
+        return self._compiled(x, layers, self.config.expert, segment, frame, cache, modulations, output)
 
 
 def synchronise(device: str) -> None:
@@ -96,7 +114,10 @@ def chunk_functions(
             return sample(geom_embs=embs, geom_pad=pad)
 
         functions |= {BESIDE: lambda: sample(geometry=pending), BEFORE: before}
-    if args.compiled:
+    if "ours" in args.compiled:
+        own_compiled = CompiledRunner(ours)
+        functions[OWN_COMPILED] = lambda: own_compiled(*short, noise=noise, geom_embs=tokens)
+    if "lerobot" in args.compiled:
         compiled = torch.compile(lerobot.sample_actions, mode="max-autotune")  # as LeRobot's compile_model does
         functions[COMPILED] = lambda: compiled(*padded, noise=noise)
     return functions
@@ -196,11 +217,8 @@ def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) 
     parts, least = split(args, cameras, ours), floor(args, cameras, ours)
     with_geometry = statistics.median(a / b for a, b in zip(times[GEOMETRY], times[PLAIN], strict=True))
     ratios = {"geometry over no geometry": with_geometry}
-    for name, (one, other) in {
-        "beside over before": (BESIDE, BEFORE),
-        "graphs over none": (GEOMETRY, NO_GRAPHS),
-    }.items():
-        if other in times:
+    for name, (one, other) in PAIRS.items():
+        if one in times and other in times:
             ratios[name] = statistics.median(a / b for a, b in zip(times[one], times[other], strict=True))
     return {
         "arms": result,
@@ -219,7 +237,11 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--cameras", type=int, nargs="+", default=[1])
     parser.add_argument(
-        "--compiled", action="store_true", help="LeRobot's compile_model=True too (minutes of compiling)"
+        "--compiled",
+        choices=("lerobot", "ours"),
+        nargs="+",
+        default=[],
+        help="also LeRobot's with compile_model=True (minutes of compiling), or the runner's layers (half a minute)",
     )
     parser.add_argument("--chunk", type=int, default=50, help="action steps")
     parser.add_argument("--prompt", type=int, default=100, help="prompt tokens; a state of 14 numbers takes some 70")
@@ -248,7 +270,7 @@ def main() -> None:
         print(f"{cameras} camera(s)")
         for arm, row in found["arms"].items():
             print(f"  {arm:20} p50 {row['p50_ms']:9.1f} ms   p95 {row['p95_ms']:9.1f} ms   ratio {row['ratio']:.2f}")
-        for name in ("geometry over no geometry", "beside over before", "graphs over none", "chunk over floor", "far"):
+        for name in ("geometry over no geometry", *PAIRS, "chunk over floor", "far"):
             if name in found:
                 print(f"  {name} {found[name]:.3g}")
         for name in ("split_ms", "floor_ms"):
