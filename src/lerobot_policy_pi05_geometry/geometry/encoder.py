@@ -38,7 +38,7 @@ class _Look(NamedTuple):
             return cls(alive, None, missing)
         arrived = torch.cuda.Event()
         copy = alive.to("cpu", non_blocking=True)  # into pinned memory
-        arrived.record()
+        arrived.record(torch.cuda.current_stream(alive.device))
         return cls(copy, arrived, missing)
 
     @property
