@@ -13,7 +13,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from lerobot_policy_pi05_geometry.geometry import encoder
 from lerobot_policy_pi05_geometry.model import fused, runner
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
-from tests.doors import CHUNK, WRIST, make_batch, make_config, without
+from tests.doors import CHUNK, WRIST, make_batch, make_config, redraw, without
 from tests.geometry.da3.tiny import tiny_encoder
 
 
@@ -90,6 +90,29 @@ def test_no_value_is_asked_for_and_nothing_copied(fake, changes) -> None:
         with NoCopies():
             actions = policy.predict_action_chunk(batch, noise=noise, runner="eager")
     assert actions.device.type == "cuda"
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("runner_name", ["fast", "eager"])
+@pytest.mark.parametrize("source", ["rgbd", "da3", "none"])
+def test_a_gpu_is_not_waited_for(source, runner_name) -> None:
+    encoder = {"encoder": tiny_encoder()} if source == "da3" else {}
+    settings = {"device": "cuda", "geometry_source": source, "da3_image_size": 42, "da3_dtype": "float32"}
+    policy = redraw(PI05GeometryPolicy(make_config(**settings), **encoder)).eval()
+    batch = {key: value.cuda() if isinstance(value, Tensor) else value for key, value in make_batch(1).items()}
+    noise = torch.randn(1, CHUNK, 8, device="cuda")
+    plain = policy.predict_action_chunk(batch, noise=noise, runner="plain")
+    for _ in range(2):  # the first observation is looked into, and the first chunk recorded
+        policy.predict_action_chunk(batch, noise=noise, runner=runner_name)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        found = policy.predict_action_chunk(batch, noise=noise, runner=runner_name)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert (found - plain).abs().max() <= 1e-4
+    recorded = policy.sampler.explain(runner_name)["CUDA graphs"].startswith("active: 1 of")
+    assert recorded == (runner_name == "fast")
 
 
 def test_waiting_would_be_found(fake) -> None:
