@@ -31,6 +31,7 @@ from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS, Da3Backbone, Da3
 from lerobot_policy_pi05_geometry.geometry.da3.encoder import store_products_in
 from lerobot_policy_pi05_geometry.model import PI05Pytorch
 from lerobot_policy_pi05_geometry.model.fast_layers import run_layers
+from lerobot_policy_pi05_geometry.model.graphs import GraphRunner
 from lerobot_policy_pi05_geometry.model.runner import ChunkRunner, Observation
 from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.model.side_stream import GeometryTokens, PendingGeometry
@@ -44,16 +45,20 @@ PAIRS = {
 }
 
 
-class CompiledRunner(ChunkRunner):
-    """The runner with compiled layers, without graphs. Policies do not have it, since it did not pay (docs/results.md)."""
+class CompiledLayers(ChunkRunner):
+    """A runner with compiled layers. Policies do not have it: on a CPU it gains little and costs long (docs/results.md)."""
 
     def _build(self) -> None:
         super()._build()
-        self._compiled = torch.compile(run_layers, dynamic=False)
+        self._compiled = torch.compile(run_layers, dynamic=False, fullgraph=True)
 
     def _run(self, segment, embs, frame, cache, modulations, output):
         x, layers = embs.to(self.config.dtype), self._layers[segment]
-        return self._compiled(x, layers, self.config.expert, segment, frame, cache, modulations, output)
+        return self._compiled(x, layers, self.config.expert, frame, cache, cache.span(segment), modulations, output)
+
+
+class CompiledGraphs(CompiledLayers, GraphRunner):
+    """The same, recorded."""
 
 
 def synchronise(device: str) -> None:
@@ -115,7 +120,8 @@ def chunk_functions(
 
         functions |= {BESIDE: lambda: sample(geometry=pending), BEFORE: before}
     if "ours" in args.compiled:
-        own_compiled = CompiledRunner(ours)
+        torch._dynamo.config.recompile_limit = 64  # every number of cameras is a shape of its own
+        own_compiled = CompiledLayers(ours) if args.device == "cpu" else CompiledGraphs(ours)
         functions[OWN_COMPILED] = lambda: own_compiled(*short, noise=noise, geom_embs=tokens)
     if "lerobot" in args.compiled:
         compiled = torch.compile(lerobot.sample_actions, mode="max-autotune")  # as LeRobot's compile_model does
@@ -198,6 +204,7 @@ def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) 
     """Times of all arms with this many cameras."""
     functions = chunk_functions(args, cameras, ours, lerobot)
     times: dict[str, list[float]] = {arm: [] for arm in functions}
+    first = {arm: seconds(function, args.device) for arm, function in functions.items()}  # compiled or recorded, if so
     for round_index in range(args.rounds + args.warmup):
         for arm, function in functions.items():
             value = seconds(function, args.device)
@@ -211,6 +218,7 @@ def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) 
             "p50_ms": 1e3 * statistics.median(values),
             "p95_ms": 1e3 * ordered[min(len(ordered) - 1, round(0.95 * len(ordered)))],
             "ratio": statistics.median(ratios),
+            "first_s": first[arm],
         }
     if args.trace:
         trace(args, cameras, functions)
@@ -269,7 +277,9 @@ def main() -> None:
         summary[f"{cameras} cameras"] = found
         print(f"{cameras} camera(s)")
         for arm, row in found["arms"].items():
-            print(f"  {arm:20} p50 {row['p50_ms']:9.1f} ms   p95 {row['p95_ms']:9.1f} ms   ratio {row['ratio']:.2f}")
+            print(
+                f"  {arm:20} p50 {row['p50_ms']:9.1f} ms   p95 {row['p95_ms']:9.1f} ms   ratio {row['ratio']:.2f}   first {row['first_s']:.1f} s"
+            )
         for name in ("geometry over no geometry", *PAIRS, "chunk over floor", "far"):
             if name in found:
                 print(f"  {name} {found[name]:.3g}")

@@ -13,7 +13,6 @@ from torch import Tensor
 from .cache import SegmentKVCache
 from .fused import FusedLayer
 from .gemma import RMS_EPS
-from .layout import Segment
 from .variants import GemmaVariant
 
 
@@ -43,17 +42,17 @@ def run_layers(
     x: Tensor,
     layers: Sequence[FusedLayer],
     variant: GemmaVariant,
-    segment: Segment,
     frame: SegmentFrame,
     cache: SegmentKVCache,
+    span: slice,
     modulations: Sequence[LayerModulation] | None,
     output: bool,
 ) -> Tensor:
     """x (B, N, W) through all layers, keys and values into the cache; without `output` the last one stops there.
 
-    modulations: per layer, or None for plain norms. variant: of the expert, whose heads are the VLM's too.
+    span: the segment's columns in the cache. modulations: per layer, or None for plain norms. variant: of the expert, whose
+    heads are the VLM's too.
     """
-    span = cache.span(segment)
     for index, weights in enumerate(layers):
         modulation = None if modulations is None else modulations[index]
         keys, values = cache.keys[index], cache.values[index]

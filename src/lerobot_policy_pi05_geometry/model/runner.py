@@ -216,7 +216,7 @@ class ChunkRunner:
     ) -> Tensor:
         """Embeddings (B, N, W) of a segment through its layers, in the compute dtype."""
         x, layers = embs.to(self.config.dtype), self._layers[segment]
-        return run_layers(x, layers, self.config.expert, segment, frame, cache, modulations, output)
+        return run_layers(x, layers, self.config.expert, frame, cache, cache.span(segment), modulations, output)
 
     # --- what is the same in every layer ------------------------------------------------------------------------------
 
