@@ -91,7 +91,7 @@ def bench(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int = 20) -
 
 
 def _parts(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int, device: str) -> dict[str, Timing]:
-    """The same prediction, step by step."""
+    """The same prediction, step by step, so on a GPU without graphs: its parts take longer than the whole."""
     policy = loaded.policy
     config, runner = policy.config, ChunkRunner(policy.model)
     in_prefix = policy.model.geometry_in_prefix

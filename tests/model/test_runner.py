@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, PI05Pytorch
 from lerobot_policy_pi05_geometry.model.config import RunnerName
+from lerobot_policy_pi05_geometry.model.graphs import GraphRunner
 from lerobot_policy_pi05_geometry.model.runner import ChunkRunner
 from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.model.side_stream import GeometryTokens, PendingGeometry
@@ -258,6 +259,17 @@ def test_pending_geometry_is_measured_once_whoever_computes(runner: RunnerName) 
     found = ChunkSampler(network)(*batch.observation, noise=batch.noise, num_steps=3, geometry=pending, runner=runner)
     assert torch.equal(found, fast(ChunkSampler(network), batch, runner=runner))
     assert len(times) == 1
+
+
+def test_a_network_that_moved_leaves_no_runner_behind() -> None:
+    network = build_network(SEGMENT, seed=87).eval()
+    sampler, batch = ChunkSampler(network), draw(network, Case(seed=14))
+    before = fast(sampler, batch)
+    elsewhere = GraphRunner(network)
+    elsewhere.device = torch.device("meta")  # as if it had been built on another device
+    sampler._runners[GraphRunner] = elsewhere
+    assert torch.equal(fast(sampler, batch), before)
+    assert list(sampler._runners) == [ChunkRunner]
 
 
 def test_a_copied_sampler_follows_the_copied_network() -> None:

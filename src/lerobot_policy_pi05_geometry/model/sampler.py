@@ -67,6 +67,8 @@ class ChunkSampler:
         if reason is not None:
             return reason
         wanted = self._class(runner)
+        # One that was built where the network is no longer would keep that device's memory.
+        self._runners = {kind: built for kind, built in self._runners.items() if built.device == self._device}
         try:
             if wanted not in self._runners:
                 self._runners[wanted] = wanted(network)
