@@ -46,7 +46,7 @@ PAIRS = {
 
 
 class CompiledLayers(ChunkRunner):
-    """A runner with compiled layers. Policies do not have it: on a CPU it gains little and costs long (docs/results.md)."""
+    """A runner with compiled layers. Policies do not have it: on a CPU it gains nothing and takes long (docs/results.md)."""
 
     def _build(self) -> None:
         super()._build()
