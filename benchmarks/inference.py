@@ -1,14 +1,16 @@
-"""Time and memory of an action chunk: ours with geometry, ours without, LeRobot's π0.5 eager and, if asked, compiled.
+"""Time of an action chunk: ours with geometry, ours without, LeRobot's π0.5 eager and, if asked, compiled.
 
     python -m benchmarks.inference --cameras 1 3                 small size, float32
     python -m benchmarks.inference --cameras 1 3 --full          released size, bfloat16, random weights (needs about 20 GB)
-    python -m benchmarks.inference --full --device cuda --compiled
+    python -m benchmarks.inference --cameras 1 3 --full --device cuda --compiled lerobot ours --da3 base --trace traces
 
 All arms run the same weights and observations in one process, in turn, round by round; a ratio is the median over rounds of
-an arm's time over eager LeRobot's in the same round. Ours is what a policy uses by default (the runner), with geometry features
-given: what measures them (depth, or Depth Anything 3) is not in it. Ours pads the prompt (`--prompt` tokens) to what it needs,
-LeRobot's always to 200. The floor is what this machine's own matrix products and memory would need for our network's
-products alone, measured in the same run.
+an arm's time over eager LeRobot's in the same round. Ours is what a policy uses by default (the runner; on a GPU as CUDA graphs,
+with an arm without them beside it), with geometry features given: what measures depth is not in it. `--da3` adds two arms that
+also measure: Depth Anything 3 with random weights on the same cameras, beside vision and prefix, and before them. Ours pads the
+prompt (`--prompt` tokens) to what it needs, on a GPU to the next multiple of 32; LeRobot's always to 200. The floor is what this
+machine's own matrix products and memory would need for our network's products alone, measured in the same run. `far` is the
+distance of the runner's actions from the plain path's, over the size of those.
 """
 
 import argparse
@@ -17,16 +19,46 @@ import platform
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from benchmarks.network import build, inputs
-from lerobot_policy_pi05_geometry.model import PI05Pytorch, Segment
-from lerobot_policy_pi05_geometry.model.runner import ChunkRunner
+from benchmarks.network import build, fill, inputs
+from lerobot_policy_pi05_geometry.geometry import GeometryEncoder
+from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS, Da3Backbone, Da3Encoder, Da3Source
+from lerobot_policy_pi05_geometry.geometry.da3.encoder import store_products_in
+from lerobot_policy_pi05_geometry.model import PI05Pytorch
+from lerobot_policy_pi05_geometry.model.fast_layers import run_layers
+from lerobot_policy_pi05_geometry.model.graphs import GraphRunner
+from lerobot_policy_pi05_geometry.model.runner import ChunkRunner, Observation
+from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
+from lerobot_policy_pi05_geometry.model.side_stream import GeometryTokens, PendingGeometry
 
 EAGER, COMPILED, GEOMETRY, PLAIN = "lerobot", "lerobot compiled", "geometry", "no geometry"
+NO_GRAPHS, OWN_COMPILED, BESIDE, BEFORE = "geometry, no graphs", "geometry, compiled", "da3 beside", "da3 before"
+PAIRS = {
+    "beside over before": (BESIDE, BEFORE),
+    "graphs over none": (GEOMETRY, NO_GRAPHS),
+    "compiled over not": (OWN_COMPILED, GEOMETRY),
+}
+
+
+class CompiledLayers(ChunkRunner):
+    """A runner with compiled layers. Policies do not have it: on a CPU it gains nothing and takes long (docs/results.md)."""
+
+    def _build(self) -> None:
+        super()._build()
+        self._compiled = torch.compile(run_layers, dynamic=False, fullgraph=True)
+
+    def _run(self, segment, embs, frame, cache, modulations, output):
+        x, layers = embs.to(self.config.dtype), self._layers[segment]
+        return self._compiled(x, layers, self.config.expert, frame, cache, cache.span(segment), modulations, output)
+
+
+class CompiledGraphs(CompiledLayers, GraphRunner):
+    """The same, recorded."""
 
 
 def synchronise(device: str) -> None:
@@ -42,57 +74,104 @@ def seconds(run: Callable[[], object], device: str) -> float:
     return time.perf_counter() - start
 
 
+def observe(args: argparse.Namespace, cameras: int, tokens: int) -> tuple[Observation, Tensor]:
+    """The same observation for everyone, with a prompt padded to `tokens`, and noise, on the device."""
+    batch = inputs(argparse.Namespace(**{**vars(args), "cameras": cameras}), tokens)
+    images, masks = ([x.to(args.device) for x in batch[name]] for name in ("images", "img_masks"))
+    text = batch["tokens"].to(args.device), batch["masks"].to(args.device)
+    return Observation(images, masks, *text), batch["noise"].to(args.device)
+
+
+def geometry_tokens(args: argparse.Namespace, ours: PI05Pytorch) -> Tensor:
+    generator = torch.Generator().manual_seed(2)
+    return torch.randn(1, args.geometry_tokens, ours.geometry_width, generator=generator).to(args.device)
+
+
+def da3(args: argparse.Namespace, observation: Observation, ours: PI05Pytorch) -> PendingGeometry:
+    """Depth Anything 3 on the cameras of an observation, 8 x 8 cells each."""
+    backbone = Da3Backbone(VARIANTS[args.da3])
+    fill(backbone)
+    store_products_in(backbone, torch.bfloat16)
+    batch = {f"observation.images.{i}": (image + 1) / 2 for i, image in enumerate(observation.images)}
+    source = Da3Source({key: key for key in batch}, 8, Da3Encoder(backbone))
+    encoder = GeometryEncoder(source, ours.geometry_width).eval().to(args.device)
+    return PendingGeometry(source.num_tokens, partial(encoder, batch))
+
+
 def chunk_functions(
     args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot
 ) -> dict[str, Callable[[], Tensor]]:
     """A chunk of each arm, from the same observation."""
-    settings = argparse.Namespace(**{**vars(args), "cameras": cameras})
-
-    def observation(tokens: int) -> tuple[tuple, Tensor]:
-        batch = inputs(settings, tokens)
-        noise = batch.pop("noise").to(args.device)
-        moved = ([x.to(args.device) for x in batch[name]] for name in ("images", "img_masks"))
-        return (*moved, batch["tokens"].to(args.device), batch["masks"].to(args.device)), noise
-
-    (short, noise), (padded, _) = observation(args.prompt), observation(200)
-    runner = ChunkRunner(ours)
-    tokens = torch.randn(1, args.geometry_tokens, ours.geometry_width, generator=torch.Generator().manual_seed(2))
-    tokens = tokens.to(args.device)
-    functions = {
-        GEOMETRY: lambda: runner(*short, noise=noise, geom_embs=tokens),
-        PLAIN: lambda: runner(*short, noise=noise),
+    (short, noise), (padded, _) = observe(args, cameras, args.prompt), observe(args, cameras, 200)
+    sample, tokens = partial(ChunkSampler(ours), *short, noise=noise), geometry_tokens(args, ours)
+    functions: dict[str, Callable[[], Tensor]] = {
+        GEOMETRY: lambda: sample(geom_embs=tokens),
+        PLAIN: sample,
         EAGER: lambda: lerobot.sample_actions(*padded, noise=noise),
     }
-    if args.compiled:
+    if args.device != "cpu":
+        functions[NO_GRAPHS] = lambda: sample(geom_embs=tokens, runner="eager")
+    if args.da3:
+        pending = da3(args, short, ours)
+
+        def before() -> Tensor:
+            embs, pad = pending.measure()
+            return sample(geom_embs=embs, geom_pad=pad)
+
+        functions |= {BESIDE: lambda: sample(geometry=pending), BEFORE: before}
+    if "ours" in args.compiled:
+        torch._dynamo.config.recompile_limit = 64  # every number of cameras is a shape of its own
+        own_compiled = CompiledLayers(ours) if args.device == "cpu" else CompiledGraphs(ours)
+        functions[OWN_COMPILED] = lambda: own_compiled(*short, noise=noise, geom_embs=tokens)
+    if "lerobot" in args.compiled:
         compiled = torch.compile(lerobot.sample_actions, mode="max-autotune")  # as LeRobot's compile_model does
         functions[COMPILED] = lambda: compiled(*padded, noise=noise)
     return functions
 
 
+def far(args: argparse.Namespace, cameras: int, ours: PI05Pytorch) -> float:
+    """How far the runner's actions are from the plain path's, over four draws of noise."""
+    (observation, noise), tokens = observe(args, cameras, args.prompt), geometry_tokens(args, ours)
+    sampler = ChunkSampler(ours)
+
+    def actions(runner: str, seed: int) -> Tensor:
+        other = torch.randn(noise.shape, generator=torch.Generator().manual_seed(seed)).to(noise)
+        return sampler(*observation, noise=other, geom_embs=tokens, runner=runner)
+
+    fast, plain = (torch.stack([actions(runner, seed) for seed in range(4)]) for runner in ("fast", "plain"))
+    return ((fast - plain).norm() / plain.norm()).item()
+
+
 def split(args: argparse.Namespace, cameras: int, ours: PI05Pytorch) -> dict[str, float]:
-    """Where the runner's time goes: medians of vision and text, prefix, geometry, and all denoising steps, in seconds."""
-    settings = argparse.Namespace(**{**vars(args), "cameras": cameras})
-    batch, runner = inputs(settings, args.prompt), ChunkRunner(ours)
-    noise = batch.pop("noise").to(args.device)
-    observation = [[x.to(args.device) for x in batch[name]] for name in ("images", "img_masks")]
-    observation += [batch["tokens"].to(args.device), batch["masks"].to(args.device)]
-    embs = torch.zeros(1, args.geometry_tokens, ours.geometry_width, device=args.device)
+    """Where the runner's time goes without graphs: medians of its parts and all denoising steps, in seconds."""
+    (observation, noise), runner = observe(args, cameras, args.prompt), ChunkRunner(ours)
+    embs = geometry_tokens(args, ours)
+    geometry = GeometryTokens(embs, torch.ones(embs.shape[:2], dtype=torch.bool, device=embs.device))
     times: dict[str, list[float]] = {"vision and text": [], "prefix": [], "geometry": [], "denoising": []}
+
+    def timed[T](part: str, run: Callable[[], T]) -> T:
+        result: list[T] = []
+        times[part].append(seconds(lambda: result.append(run()), args.device))
+        return result[0]
+
     for _ in range(args.rounds + 1):
-        prepared: list = []
-        times["vision and text"].append(
-            seconds(lambda into=prepared: into.append(runner.prepare(*observation, noise, embs, None)), args.device)
-        )
-        segments, frames, cache = prepared[0]
-        times["prefix"].append(
-            seconds(lambda a=(Segment.PREFIX, segments, frames, cache): runner.prefill(*a), args.device)
-        )
-        times["geometry"].append(
-            seconds(lambda a=(Segment.GEOMETRY, segments, frames, cache): runner.prefill(*a), args.device)
-        )
-        steps = ours.config.num_inference_steps
-        times["denoising"].append(seconds(lambda a=(noise, steps, frames, cache): runner.denoise(*a), args.device))
+        prefix = timed("vision and text", partial(runner.embed, observation))
+        context = timed("prefix", partial(runner.prefill, prefix, (args.geometry_tokens, noise.shape[1])))
+        pad = timed("geometry", partial(runner.prefill_geometry, context, geometry))
+        timed("denoising", partial(runner.denoise, context, noise, pad, ours.config.num_inference_steps))
     return {part: statistics.median(values[1:]) for part, values in times.items()}
+
+
+def trace(args: argparse.Namespace, cameras: int, functions: dict[str, Callable[[], Tensor]]) -> None:
+    """A chunk of each arm as a file for chrome://tracing or Perfetto."""
+    args.trace.mkdir(parents=True, exist_ok=True)
+    for arm, function in functions.items():
+        synchronise(args.device)
+        with torch.profiler.profile() as profiler:
+            function()
+            synchronise(args.device)
+        name = arm.replace(",", "").replace(" ", "_")
+        profiler.export_chrome_trace(str(args.trace / f"{cameras}_cameras_{name}.json"))
 
 
 def floor(args: argparse.Namespace, cameras: int, ours: PI05Pytorch) -> dict[str, float]:
@@ -124,6 +203,7 @@ def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) 
     """Times of all arms with this many cameras."""
     functions = chunk_functions(args, cameras, ours, lerobot)
     times: dict[str, list[float]] = {arm: [] for arm in functions}
+    first = {arm: seconds(function, args.device) for arm, function in functions.items()}  # compiled or recorded, if so
     for round_index in range(args.rounds + args.warmup):
         for arm, function in functions.items():
             value = seconds(function, args.device)
@@ -137,12 +217,20 @@ def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) 
             "p50_ms": 1e3 * statistics.median(values),
             "p95_ms": 1e3 * ordered[min(len(ordered) - 1, round(0.95 * len(ordered)))],
             "ratio": statistics.median(ratios),
+            "first_s": first[arm],
         }
+    if args.trace:
+        trace(args, cameras, functions)
     parts, least = split(args, cameras, ours), floor(args, cameras, ours)
     with_geometry = statistics.median(a / b for a, b in zip(times[GEOMETRY], times[PLAIN], strict=True))
+    ratios = {"geometry over no geometry": with_geometry}
+    for name, (one, other) in PAIRS.items():
+        if one in times and other in times:
+            ratios[name] = statistics.median(a / b for a, b in zip(times[one], times[other], strict=True))
     return {
         "arms": result,
-        "geometry over no geometry": with_geometry,
+        **ratios,
+        "far": far(args, cameras, ours),
         "split_ms": {part: 1e3 * value for part, value in parts.items()},
         "floor_ms": {part: 1e3 * value for part, value in least.items()},
         "chunk over floor": result[GEOMETRY]["p50_ms"] / (1e3 * sum(least.values())),
@@ -156,11 +244,19 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--cameras", type=int, nargs="+", default=[1])
     parser.add_argument(
-        "--compiled", action="store_true", help="LeRobot's compile_model=True too (minutes of compiling)"
+        "--compiled",
+        choices=("lerobot", "ours"),
+        nargs="+",
+        default=[],
+        help="also LeRobot's with compile_model=True (minutes of compiling), or the runner's layers (half a minute)",
     )
     parser.add_argument("--chunk", type=int, default=50, help="action steps")
     parser.add_argument("--prompt", type=int, default=100, help="prompt tokens; a state of 14 numbers takes some 70")
     parser.add_argument("--geometry-tokens", type=int, default=64)
+    parser.add_argument(
+        "--da3", choices=sorted(VARIANTS), help="also measure geometry with Depth Anything 3 of this size"
+    )
+    parser.add_argument("--trace", type=Path, help="write a trace of each arm into this folder")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--warmup", type=int, default=1)
     parser.add_argument("--output", type=Path, help="write the numbers to this JSON file")
@@ -173,18 +269,20 @@ def main() -> None:
     machine = f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"
     summary: dict = {
         "machine": torch.cuda.get_device_name() if args.device != "cpu" else machine,
-        "settings": {name: value for name, value in vars(args).items() if name != "output"},
+        "settings": {name: value for name, value in vars(args).items() if name not in ("output", "trace")},
     }
     for cameras in args.cameras:
         found = measure(args, cameras, ours, lerobot)
         summary[f"{cameras} cameras"] = found
         print(f"{cameras} camera(s)")
         for arm, row in found["arms"].items():
-            print(f"  {arm:18} p50 {row['p50_ms']:9.1f} ms   p95 {row['p95_ms']:9.1f} ms   ratio {row['ratio']:.2f}")
-        print(f"  geometry costs {found['geometry over no geometry']:.3f} of ours without")
+            shown = f"p50 {row['p50_ms']:9.1f} ms   p95 {row['p95_ms']:9.1f} ms   first {row['first_s']:6.1f} s"
+            print(f"  {arm:20} {shown}   ratio {row['ratio']:.2f}")
+        for name in ("geometry over no geometry", *PAIRS, "chunk over floor", "far"):
+            if name in found:
+                print(f"  {name} {found[name]:.3g}")
         for name in ("split_ms", "floor_ms"):
             print(f"  {name:10}" + "   ".join(f"{part} {value:.1f}" for part, value in found[name].items()))
-        print(f"  chunk over floor {found['chunk over floor']:.2f}")
     if args.output:
         args.output.write_text(json.dumps(summary, indent=2))
 

@@ -1,6 +1,7 @@
 """The policy on a robot: chunks, the action queue, failing cameras, real-time chunking."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -10,6 +11,9 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 
 from lerobot_policy_pi05_geometry.inputs import prepare_images
+from lerobot_policy_pi05_geometry.model.graphs import GraphRunner
+from lerobot_policy_pi05_geometry.model.runner import ChunkRunner
+from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from tests.doors import (
     ACTION_DIM,
@@ -18,12 +22,14 @@ from tests.doors import (
     GEOMETRY,
     TOKEN_MASK,
     TOKENS,
+    WRIST,
     WRIST_DEPTH,
     chunk_of,
     make_batch,
     make_policy,
     without,
 )
+from tests.model.tape import TapeRecorder
 
 # --- acting -------------------------------------------------------------------------------------------------------
 
@@ -88,6 +94,49 @@ def test_a_depth_camera_may_fail_in_the_middle_of_an_episode(caplog):
     noise = torch.zeros(1, CHUNK, 8)
     recovered = policy.predict_action_chunk(batch, noise=noise)
     assert torch.equal(recovered, make_policy(n_action_steps=1).predict_action_chunk(batch, noise=noise))
+
+
+# --- recorded chunks ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recording(monkeypatch) -> None:
+    """Policies act as on a GPU: chunks are recorded, by tapes instead of CUDA graphs."""
+    on_tape = partial(GraphRunner, new_recorder=TapeRecorder)
+    monkeypatch.setattr(ChunkSampler, "_class", lambda sampler, runner: ChunkRunner if runner == "eager" else on_tape)
+
+
+@pytest.mark.parametrize("changes", [{}, {"geometry_placement": "prefix"}, {"geometry_source": "none"}], ids=str)
+def test_recorded_chunks_follow_whatever_the_robot_sees(recording, changes):
+    policy = make_policy(absent_cameras=[WRIST], **changes)
+    sizes, blind = set(), without(make_batch(1), FRONT_DEPTH, WRIST_DEPTH)
+    seen = [
+        make_batch(1),
+        make_batch(2),
+        make_batch(1, 4),
+        without(make_batch(1, 5), FRONT_DEPTH),
+        blind,
+        make_batch(2, 6),
+    ]
+    longer = {TOKENS: torch.arange(40)[None], TOKEN_MASK: torch.ones(1, 40, dtype=torch.bool)}
+    for batch in [*seen, without(make_batch(1, 7), WRIST), make_batch(1, 8) | longer, make_batch(1)]:
+        noise = torch.randn(len(batch[TOKENS]), CHUNK, 8)
+        found = policy.predict_action_chunk(batch, noise=noise)
+        expected = policy.predict_action_chunk(batch, noise=noise, runner="plain")
+        assert (found - expected).abs().max() <= 1e-5
+        sizes.add((len(batch[TOKENS]), batch[TOKENS].shape[1], WRIST in batch))
+    said = policy.sampler.explain()
+    assert said["CUDA graphs"] == f"active: {len(sizes)} of at most 8 shapes of inputs recorded"
+    assert said["prompt"] == "padded to a multiple of 32 tokens, one graph each"
+    assert policy.sampler.explain("eager")["prompt"] == "as long as the longest of the batch"
+
+
+def test_recorded_chunks_are_declined_where_guidance_is_asked_for(recording, caplog):
+    policy, batch = make_rtc_policy(), make_batch(1)
+    left_over = {"prev_chunk_left_over": torch.randn(1, 4, ACTION_DIM), "inference_delay": 1, "execution_horizon": 4}
+    assert policy.predict_action_chunk(batch, **left_over).isfinite().all()
+    assert "real-time chunking" in caplog.text
+    assert policy.sampler.explain()["runner"].startswith("declined: real-time chunking")
 
 
 # --- real-time chunking -------------------------------------------------------------------------------------------

@@ -31,9 +31,10 @@ def test_every_part_is_timed_and_the_parts_are_the_whole():
     assert result.explanation["runner"] == "active"
 
 
-def test_parts_give_the_policys_own_actions():
+@pytest.mark.parametrize("changes", [{}, {"geometry_placement": "prefix"}, {"geometry_source": "none"}], ids=str)
+def test_parts_give_the_policys_own_actions(changes):
     """The pieces that are timed are the prediction, not something like it."""
-    loaded, seen = load(), []
+    loaded, seen = load(**changes), []
     noise = torch.randn(1, CHUNK, 8, generator=torch.Generator().manual_seed(3))
     batch = loaded.preprocess(make_observation(1))
     expected = loaded.postprocess(loaded.policy.predict_action_chunk(batch, noise=noise)[:, 0])

@@ -10,14 +10,13 @@ from typing import Any
 import torch
 from lerobot.configs import FeatureType
 from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
-from torch import Tensor
 
 from .configuration_pi05_geometry import PI05GeometryConfig
 from .geometry.keys import CALIBRATION_PREFIX, DEPTH_SUFFIX, IMAGE_PREFIX, extrinsics_key
 from .inputs import prepare_images
 from .loading import LoadedPolicy
-from .model import Segment
-from .model.runner import ChunkRunner
+from .model.runner import ChunkRunner, Observation
+from .model.side_stream import GeometryTokens
 
 PARTS = ("prompt and state", "geometry features", "vision and text", "prefix", "geometry", "denoising", "actions out")
 _LARGE = 0.3  # share of the time from which on a part is worth advice
@@ -82,7 +81,7 @@ def bench(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int = 20) -
     chunk = _time(predict, rounds, device)
     peak = torch.cuda.max_memory_allocated() if device.startswith("cuda") else None
     plain = _time(lambda: predict(runner="plain"), rounds, device)
-    explanation = policy.sampler.explain()
+    explanation = policy.sampler.explain(policy.config.inference_runner)  # type: ignore[arg-type]
     parts = _parts(loaded, observation, rounds, device) if explanation["runner"] == "active" else {}
     fewer = max(1, policy.config.num_inference_steps // 2)
     halved = _time(lambda: predict(num_steps=fewer), rounds, device)
@@ -92,9 +91,10 @@ def bench(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int = 20) -
 
 
 def _parts(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int, device: str) -> dict[str, Timing]:
-    """The same prediction, step by step."""
+    """The same prediction, step by step, so on a GPU without graphs: its parts take longer than the whole."""
     policy = loaded.policy
     config, runner = policy.config, ChunkRunner(policy.model)
+    in_prefix = policy.model.geometry_in_prefix
     times: dict[str, list[float]] = {part: [] for part in PARTS}
     noise = torch.randn(1, config.chunk_size, config.max_action_dim).to(device)
 
@@ -106,19 +106,24 @@ def _parts(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int, devic
         times[part].append(1e3 * (time.perf_counter() - start))
         return result
 
-    def look(batch: dict[str, Any], embs: Tensor | None, pad: Tensor | None) -> Any:
+    def measure(batch: dict[str, Any]) -> GeometryTokens | None:
+        return None if policy.geometry is None else policy.geometry(batch)
+
+    def embed(batch: dict[str, Any], tokens: GeometryTokens | None) -> Any:
         images, masks = prepare_images(batch, config, torch.device(device))
         text = (batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK])
-        return runner.prepare(images, masks, *text, noise, embs, pad)
+        return runner.embed(Observation(images, masks, *text), tokens if in_prefix else None)
 
     width = config.action_feature.shape[0]
     for _ in range(rounds + 2):
         batch = step("prompt and state", partial(loaded.preprocess, dict(observation)))
-        tokens = step("geometry features", partial(policy._geometry_tokens, batch))
-        prepared = step("vision and text", partial(look, batch, *tokens))
-        step("prefix", partial(runner.prefill, Segment.PREFIX, *prepared))
-        step("geometry", partial(runner.prefill, Segment.GEOMETRY, *prepared))
-        actions = step("denoising", partial(runner.denoise, noise, config.num_inference_steps, *prepared[1:]))
+        tokens = step("geometry features", partial(measure, batch))
+        prefix = step("vision and text", partial(embed, batch, tokens))
+        own = None if in_prefix else tokens  # a segment of its own
+        room = (0 if own is None else own.pad.shape[1], config.chunk_size)
+        context = step("prefix", partial(runner.prefill, prefix, room))
+        pad = step("geometry", partial(runner.prefill_geometry, context, own))
+        actions = step("denoising", partial(runner.denoise, context, noise, pad, config.num_inference_steps))
         step("actions out", partial(loaded.postprocess, actions[:, 0, :width]))
     return {part: _timing(values[2:]) for part, values in times.items()}
 

@@ -20,6 +20,7 @@ from .model.config import (
     GeometrySegmentConfig,
     GeometryTime,
     NetworkConfig,
+    RunnerName,
 )
 from .model.precision import DTYPES
 from .model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
@@ -39,7 +40,7 @@ _CHOICES = {
     "dtype": tuple(DTYPES),
     "param_dtype": tuple(DTYPES),
     "depth_unit": tuple(METRES_PER_UNIT),
-    "inference_runner": ("fast", "plain"),
+    "inference_runner": get_args(RunnerName),
     "geometry_source": ("none", "rgbd", "da3", "features", "random"),
     "da3_dtype": tuple(DTYPES),
     "geometry_frame": ("base", "camera"),
@@ -105,7 +106,8 @@ class PI05GeometryConfig(PreTrainedConfig):
     tokenizer_max_length: int = 200
 
     num_inference_steps: int = 10
-    inference_runner: str = "fast"  # fast (model/runner.py), or plain: the reference that it must equal
+    # fast (model/runner.py, on a GPU as CUDA graphs), eager (without graphs), or plain: the reference that it must equal
+    inference_runner: str = "fast"
     flow_samples: int = (
         1  # noises and flow times per training sample; they share one pass over prefix and (clean) geometry
     )

@@ -40,6 +40,7 @@ from .micro_batches import each_of, require_whole_parameters, rows_of, sum_of
 from .model import PI05Pytorch
 from .model.flow import FlowDraw, draw_flow
 from .model.sampler import ChunkSampler
+from .model.side_stream import GeometryTokens, PendingGeometry
 from .optimizer import FULL_STATE
 from .prompt import SMALL_TOKENIZER, small_number_ids
 from .stored import open_store
@@ -392,24 +393,25 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """An action chunk (B, chunk_size, action_dim), normalised.
 
-        kwargs: `noise` (B, S, max_action_dim), `num_steps`, `runner` ("fast" or "plain" instead of the configured one), and
+        kwargs: `noise` (B, S, max_action_dim), `num_steps`, `runner` (instead of the configured `inference_runner`), and
         real-time chunking's `inference_delay`, `prev_chunk_left_over` and `execution_horizon`.
         """
         self.eval()
         images, img_masks = prepare_images(batch, self.config, self.training_step.device)
-        embs, pad = self._geometry_tokens(batch)
+        geometry = None
+        if self.geometry is not None:  # measured beside vision and prefix
+            geometry = PendingGeometry(self.geometry.source.num_tokens, partial(self.geometry, batch))
         actions = self.sampler(
             images,
             img_masks,
             batch[OBS_LANGUAGE_TOKENS],
             batch[OBS_LANGUAGE_ATTENTION_MASK],
-            geom_embs=embs,
-            geom_pad=pad,
+            geometry=geometry,
             **{"runner": self.config.inference_runner, **kwargs},
         )
         return actions[..., : self.config.action_feature.shape[0]]
 
-    def _geometry_tokens(self, batch: dict[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
+    def _geometry_tokens(self, batch: dict[str, Tensor]) -> GeometryTokens | tuple[None, None]:
         return (None, None) if self.geometry is None else self.geometry(batch)
 
     def supports_rtc(self) -> bool:

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from lerobot_policy_pi05_geometry.geometry import GeometryEncoder
+from lerobot_policy_pi05_geometry.geometry.encoder import _Look
 from lerobot_policy_pi05_geometry.geometry.random_tokens import RandomSource
 from lerobot_policy_pi05_geometry.geometry.rgbd import depth_key, extrinsics_key
 from tests.geometry.scenes import calibrated, generator, make_source, random_observation, random_pose
@@ -185,3 +186,30 @@ def test_the_random_control_has_no_camera_that_could_fail():
         tokens, pad = encoder.train(training)({"observation.state": torch.zeros(2, 4)})
         assert tokens.shape == (2, CELLS, 16)
         assert pad.all()
+
+
+def test_on_a_gpu_what_was_seen_is_read_with_the_next_observation(caplog, monkeypatch):
+    """As if values were on their way: nothing is said of an observation while it is being acted on."""
+    caplog.set_level(logging.INFO)
+    waits = []
+
+    class Arrival:
+        def synchronize(self) -> None:
+            waits.append(1)
+
+    monkeypatch.setattr(_Look, "at", lambda alive, missing: _Look(alive, Arrival(), missing))
+    encoder = make_encoder("left", "right")
+    observation = observe(encoder)
+    encoder(observation)
+    assert not waits
+    _, pad = encoder(failing(observation, "right", "missing"))  # it was seen before, so this is a failure, and no error
+    assert len(waits) == 1
+    assert not pad[:, CELLS:].any()
+    assert not caplog.records
+    encoder(failing(observation, "right", "NaN"))
+    assert len(said(caplog, logging.WARNING)) == 1
+    encoder(observation)
+    assert not caplog.records
+    encoder.reset()  # the last observation of an episode is read too
+    assert "'right' is back" in said(caplog, logging.INFO)[0]
+    assert len(waits) == 4

@@ -1,7 +1,6 @@
 """Invariant 8: the runner equals the plain path, for any observation, and never acts on weights that are no longer there."""
 
 import copy
-import gc
 import logging
 
 import pytest
@@ -10,8 +9,11 @@ from hypothesis import given, settings
 from torch import Tensor, nn
 
 from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, PI05Pytorch
+from lerobot_policy_pi05_geometry.model.config import RunnerName
+from lerobot_policy_pi05_geometry.model.graphs import GraphRunner
 from lerobot_policy_pi05_geometry.model.runner import ChunkRunner
 from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
+from lerobot_policy_pi05_geometry.model.side_stream import GeometryTokens, PendingGeometry
 from tests.model.helpers import (
     EVERY_GEOMETRY,
     IN_PREFIX,
@@ -176,29 +178,18 @@ def test_weights_that_changed_after_building_act(change, dtype: torch.dtype) -> 
     assert torch.allclose(after, fast(fresh, batch), atol=1e-6)
 
 
-def test_a_network_that_has_run_still_trains() -> None:
-    """Gradients of joined weights are those of single ones."""
+@pytest.mark.parametrize("acting", [torch.no_grad, torch.inference_mode])
+def test_a_network_that_has_run_still_trains(acting) -> None:
+    """Gradients of joined weights are those of single ones. LeRobot's evaluation in training acts in inference mode."""
     joined, single = (build_network(SEGMENT, seed=61) for _ in range(2))
     batch = draw(joined, Case(seed=8, batch=2))
-    fast(ChunkRunner(joined), batch)
+    with acting():
+        fast(ChunkRunner(joined), batch)
     for network in (joined, single):
         network(*batch).mean().backward()
     for (name, a), (_, b) in zip(joined.named_parameters(), single.named_parameters(), strict=True):
         assert (a.grad is None) == (b.grad is None), name
         assert a.grad is None or torch.equal(a.grad, b.grad), name
-
-
-def test_many_chunks_leave_nothing_behind() -> None:
-    runner = runner_of(SEGMENT)
-    batches = [draw(runner.network, Case(seed=seed, batch=1)) for seed in range(4)]
-
-    def tensors_after(chunks: int) -> int:
-        for i in range(chunks):
-            fast(runner, batches[i % 4], num_steps=2)
-        gc.collect()
-        return sum(issubclass(type(thing), Tensor) for thing in gc.get_objects())
-
-    assert tensors_after(8) == tensors_after(40)
 
 
 # --- choosing -----------------------------------------------------------------------------------------------------
@@ -240,6 +231,56 @@ def test_what_the_runner_does_not_do_is_done_by_the_plain_path() -> None:
     plain = fast(ChunkSampler(network), batch, use_cache=False)
     assert torch.equal(plain, sample(network, batch, num_steps=3, use_cache=False))
     assert torch.equal(fast(ChunkSampler(network), batch, runner="plain"), sample(network, batch, num_steps=3))
+
+
+@pytest.mark.parametrize("geometry", [None, SEGMENT, IN_PREFIX], ids=name_of)
+@pytest.mark.parametrize("runner", ["fast", "eager", "plain"])
+def test_explain_says_what_a_chunk_did(geometry: GeometrySegmentConfig | None, runner: RunnerName) -> None:
+    said = ChunkSampler(build_network(geometry, seed=83).eval()).explain(runner)
+    if runner == "plain":
+        assert said == {"runner": "declined: inference_runner=plain; the plain path serves"}
+        return
+    assert said["runner"] == "active"
+    assert said["CUDA graphs"] == "declined: a cpu has none"
+    before = {None: "none", SEGMENT: "measured after the prefix", IN_PREFIX: "measured before the prefix"}[geometry]
+    assert said["geometry"].startswith(before)
+
+
+@pytest.mark.parametrize("runner", ["fast", "plain"])
+def test_pending_geometry_is_measured_once_whoever_computes(runner: RunnerName) -> None:
+    network = build_network(SEGMENT, seed=84).eval()
+    batch, times = draw(network, Case(seed=12)), []
+
+    def measure() -> GeometryTokens:
+        times.append(1)
+        return GeometryTokens(batch.geom_embs, batch.geom_pad)
+
+    pending = PendingGeometry(batch.geom_embs.shape[1], measure)
+    found = ChunkSampler(network)(*batch.observation, noise=batch.noise, num_steps=3, geometry=pending, runner=runner)
+    assert torch.equal(found, fast(ChunkSampler(network), batch, runner=runner))
+    assert len(times) == 1
+
+
+def test_a_network_that_moved_leaves_no_runner_behind() -> None:
+    network = build_network(SEGMENT, seed=87).eval()
+    sampler, batch = ChunkSampler(network), draw(network, Case(seed=14))
+    before = fast(sampler, batch)
+    elsewhere = GraphRunner(network)
+    elsewhere.device = torch.device("meta")  # as if it had been built on another device
+    sampler._runners[GraphRunner] = elsewhere
+    assert torch.equal(fast(sampler, batch), before)
+    assert list(sampler._runners) == [ChunkRunner]
+
+
+def test_a_copied_sampler_follows_the_copied_network() -> None:
+    network = build_network(SEGMENT, seed=85).eval()
+    sampler, batch = ChunkSampler(network), draw(network, Case(seed=13))
+    before = fast(sampler, batch)
+    other_network, other = copy.deepcopy((network, sampler))
+    assert not other._runners  # recorded graphs have no copies
+    randomise(other_network, 86)
+    assert not torch.allclose(fast(other, batch), before, atol=1e-3)
+    assert torch.equal(fast(sampler, batch), before)
 
 
 def test_a_runner_of_another_seed_is_another_policy() -> None:

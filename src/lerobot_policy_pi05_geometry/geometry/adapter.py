@@ -1,9 +1,10 @@
 """The trainable bridge from geometry features to expert-width tokens."""
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from ..model.precision import Float32Linear, Float32Module, compute_in_float32
+from ..model.side_stream import GeometryTokens
 from .source import GeometryFeatures
 
 
@@ -23,10 +24,10 @@ class GeometryAdapter(Float32Module):
         self.column = nn.Parameter(0.02 * torch.randn(grid, width))
         self.view = nn.Parameter(0.02 * torch.randn(num_views, width))
 
-    def forward(self, geometry: GeometryFeatures) -> tuple[Tensor, Tensor]:
+    def forward(self, geometry: GeometryFeatures) -> GeometryTokens:
         """Features (B, V, G, C) -> tokens (B, V * G, W) float32 and their padding mask (B, V * G) bool."""
         with compute_in_float32(geometry.features.device):
             tokens = self.fc_out(nn.functional.gelu(self.fc_in(self.norm(geometry.features.float()))))
             place = (self.row[:, None] + self.column[None]).flatten(0, 1)  # (G, W)
             tokens = tokens + place + self.view[:, None]
-        return tokens.flatten(1, 2), geometry.valid.flatten(1, 2)
+        return GeometryTokens(tokens.flatten(1, 2), geometry.valid.flatten(1, 2))

@@ -26,5 +26,6 @@ class RandomSource(GeometrySource):
 
     def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
         like = batch_like(batch)
-        features = self._features.to(like.device).expand(like.shape[0], -1, -1, -1)
+        self._features = self._features.to(like.device)
+        features = self._features.expand(like.shape[0], -1, -1, -1)
         return GeometryFeatures(features, torch.ones(features.shape[:3], dtype=torch.bool, device=like.device))

@@ -43,6 +43,7 @@ class RgbdSource(GeometrySource):
         self.feature_dim = FEATURE_DIM
         self.sizes, self.base_frame, self.unit, self.max_depth = dict(sizes), base_frame, unit, max_depth
         self.calibration = {camera: calibration[camera] for camera in cameras}
+        self._on_device: dict[tuple[str, torch.device], tuple[Tensor, Tensor | None]] = {}
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
         return [
@@ -78,13 +79,13 @@ class RgbdSource(GeometrySource):
     def _camera(self, camera: str, batch: Mapping[str, Tensor], check: bool) -> GeometryFeatures:
         """Features (B, G, C) and validity (B, G) of one camera."""
         key = depth_key(camera)
-        raw, calibration = batch[key], self.calibration[camera]
+        raw = batch[key]
         depth, valid = to_metres(raw, key, self.unit, self.sizes[camera], self.max_depth)
         if check:
             check_unit(raw, key, self.unit)
             if self.training:
                 check_measured(raw, key)
-        points = unproject(depth, torch.tensor(calibration.scaled_intrinsics(*depth.shape[-2:]), device=depth.device))
+        points = unproject(depth, self._constants(camera, depth.device)[0])
         if self.base_frame:
             points = transform(self._pose(camera, batch, check), points)
         valid = valid & points.isfinite().all(dim=1, keepdim=True)  # a pose that turns NaN places nothing
@@ -98,7 +99,18 @@ class RgbdSource(GeometrySource):
             if check:
                 check_rigid(pose, key)
             return pose
-        return torch.tensor(self.calibration[camera].extrinsics, device=batch[depth_key(camera)].device)
+        fixed = self._constants(camera, batch[depth_key(camera)].device)[1]
+        assert fixed is not None
+        return fixed
+
+    def _constants(self, camera: str, device: torch.device) -> tuple[Tensor, Tensor | None]:
+        """Intrinsics (4,) for images of `sizes`, and `base_T_camera` (4, 4) or None. Copied to a GPU once: it is waited for."""
+        if (camera, device) not in self._on_device:
+            calibration = self.calibration[camera]
+            intrinsics = torch.tensor(calibration.scaled_intrinsics(*self.sizes[camera]), device=device)
+            pose = calibration.extrinsics
+            self._on_device[camera, device] = intrinsics, None if pose is None else torch.tensor(pose, device=device)
+        return self._on_device[camera, device]
 
 
 def cell_statistics(points: Tensor, valid: Tensor, grid: int) -> GeometryFeatures:

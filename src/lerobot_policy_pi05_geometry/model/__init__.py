@@ -12,7 +12,8 @@
    cache       keys and values of an observation  paligemma_with_expert    the three segments, layer by layer
    precision   what stays in float32, and why     pi05        embed, train, sample
    gate        how open the door to geometry is   flow        noise that a resumed run draws again
-   runner      a whole chunk, fast: the network's arithmetic without its modules (fused: its matrices)
+   runner      a whole chunk, fast: the network's arithmetic without its modules (fused: its matrices; fast_layers: its layers)
+   graphs      the runner's chunks as CUDA graphs                 side_stream    geometry measured beside vision and prefix
    sampler     the runner, or the plain path where the runner does not apply
 ```
 """

@@ -11,6 +11,7 @@ GeometryTime = Literal["clean", "denoise"]
 GeometryPositions = Literal["sequential", "parallel"]
 GeometryPlacement = Literal["segment", "prefix"]
 GeometryExpert = Literal["shared", "own"]
+RunnerName = Literal["fast", "eager", "plain"]  # the runner, on a GPU as CUDA graphs; the runner without; the reference
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,10 @@ def _already_joined(weights: list[Tensor]) -> Tensor | None:
 
 
 class Weights:
-    """Remembers a network's modules and parameters, to notice when any was written to, replaced or moved."""
+    """Remembers a network's modules and parameters, to notice when any was written to, replaced or moved.
+
+    But not a write through `parameter.data`, of which torch keeps no account.
+    """
 
     def __init__(self, network: nn.Module) -> None:
         modules = list(network.modules())

@@ -31,6 +31,13 @@ class SegmentTokens(NamedTuple):
     pad: Tensor
     att: AttMasks
 
+    def followed_by(self, other: "SegmentTokens") -> "SegmentTokens":
+        """Both as one segment that is one block, in this one's dtype."""
+        assert self.embs is not None
+        assert other.embs is not None
+        embs = torch.cat([self.embs, other.embs.to(self.embs.dtype)], dim=1)
+        return SegmentTokens(embs, torch.cat([self.pad, other.pad], dim=1), [0] * embs.shape[1])
+
 
 class PI05Pytorch(nn.Module):
     """The network. Images in [-1, 1], actions normalised, everything a tensor; losses and actions out."""
@@ -49,9 +56,12 @@ class PI05Pytorch(nn.Module):
     @property
     def geometry_width(self) -> int:
         """Width that geometry tokens must have: the expert's, or the VLM's if they stand in its prefix."""
-        geometry = self.config.geometry
-        in_prefix = geometry is not None and geometry.placement == "prefix"
-        return self.config.paligemma.gemma.width if in_prefix else self.config.expert.width
+        return self.config.paligemma.gemma.width if self.geometry_in_prefix else self.config.expert.width
+
+    @property
+    def geometry_in_prefix(self) -> bool:
+        """Whether geometry stands among the VLM's own tokens, and not in a segment of its own."""
+        return self.config.geometry is not None and self.config.geometry.placement == "prefix"
 
     def gradient_checkpointing_enable(self) -> None:
         """Recompute each layer once in the backward pass (a layer then runs twice per training step)."""
@@ -232,6 +242,13 @@ class PI05Pytorch(nn.Module):
         prefix = self.embed_prefix(images, img_masks, tokens, masks)
         if geom_embs is None:
             return prefix, None
+        geometry = self.embed_geometry(geom_embs, geom_pad, geom_att)
+        return (prefix.followed_by(geometry), None) if self.geometry_in_prefix else (prefix, geometry)
+
+    def embed_geometry(
+        self, geom_embs: Tensor, geom_pad: Tensor | None = None, geom_att: AttMasks | None = None
+    ) -> SegmentTokens:
+        """Geometry tokens as a segment, with zeros in padded slots; arguments as in `forward`."""
         if self.config.geometry is None:
             raise ValueError(
                 "This network was built without geometry (`geometry_source=none`); it cannot use geom_embs."
@@ -241,12 +258,9 @@ class PI05Pytorch(nn.Module):
         pad = (
             torch.ones(geom_embs.shape[:2], dtype=torch.bool, device=geom_embs.device) if geom_pad is None else geom_pad
         )
-        embs = _silence(geom_embs, pad)
-        if self.config.geometry.placement == "prefix":
-            assert prefix.embs is not None
-            joined = torch.cat([prefix.embs, embs.to(prefix.embs.dtype)], dim=1)
-            return SegmentTokens(joined, torch.cat([prefix.pad, pad], dim=1), [0] * joined.shape[1]), None
-        return prefix, SegmentTokens(embs, pad, one_block(embs.shape[1]) if geom_att is None else geom_att)
+        return SegmentTokens(
+            _silence(geom_embs, pad), pad, one_block(geom_embs.shape[1]) if geom_att is None else geom_att
+        )
 
     def _prefill(self, prefix: SegmentTokens, geometry: SegmentTokens | None, suffix_length: int) -> SegmentKVCache:
         """Run prefix and (clean) geometry once and keep their keys and values."""

@@ -1,54 +1,59 @@
 """A whole action chunk, fast: the network's arithmetic without its modules. `PI05Pytorch.sample_actions` is the reference.
 
 ```
-   once per weights      fused matrices (fused.py); all modulations of all denoising steps, and of geometry's flow time 0
-   once per chunk        vision and text as in the plain path; masks with the gate in them; rotary tables; prefix, then geometry,
-                         through their layers into the cache
-   once per step         the suffix through its layers: four matrix products, one attention, one cache write a layer
+   once per weights   fused matrices (fused.py); all modulations of all denoising steps, and of geometry's flow time 0
+   once per chunk     look: vision and text as in the plain path, then the prefix through its layers into the cache
+                            (meanwhile geometry is measured: side_stream.py)
+                      act:  geometry through its layers into the cache; the suffix's masks, with the gate in them
+   once per step            the suffix through its layers: four matrix products, one attention, one cache write a layer
 ```
 
 What depends on the flow time alone is computed once and not at every step, what depends on the observation alone once per chunk
-and not in every layer. Nothing is approximated: in float32 the result is the plain path's to rounding.
+and not in every layer. Nothing is approximated: in float32 the result is the plain path's to rounding. `look` and `act` compute
+tensors from tensors without looking at a value, so a GPU can record them and need not be waited for (graphs.py).
 
 Shapes: B batch, N tokens of a segment, W width, H heads, KV key/value heads, D head_dim, K keys up to the segment's end.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from .attention import rotary_table
 from .cache import SegmentKVCache
+from .fast_layers import LayerModulation, Modulation, SegmentFrame, adaptive_norm, run_layers
 from .fused import FusedLayer, Weights, fuse
-from .gemma import RMS_EPS, AdaRMSNorm, GemmaModel
+from .gemma import AdaRMSNorm, GemmaModel
 from .layout import Segment, one_block, segment_mask, segment_positions
 from .pi05 import PI05Pytorch, SegmentTokens
 from .precision import compute_in
+from .side_stream import GeometryTokens, PendingGeometry, SideStream
 
 
-class Modulation(NamedTuple):
-    """One adaptive norm at one flow time: 1 + scale, shift (W,) float32, and the residual gate (W,) in the compute dtype."""
+class Observation(NamedTuple):
+    """What `PI05Pytorch.embed_prefix` takes. An absent camera is None, so which are there is known without a look at a value."""
 
-    scale: Tensor
-    shift: Tensor
-    gate: Tensor
-
-
-LayerModulation = tuple[Modulation, Modulation]  # before attention, before the MLP
+    images: Sequence[Tensor | None]
+    img_masks: Sequence[Tensor]
+    tokens: Tensor
+    masks: Tensor
 
 
-class SegmentFrame(NamedTuple):
-    """What is the same in every layer of a segment: rotary tables (B, 1, N, D) float32, and the mask of its queries.
+class Context(NamedTuple):
+    """What actions are denoised from: which prefix tokens are real, (B, P) bool, and the cache."""
 
-    masks: additive, one per layer or the same for all, each (B, 1 or KV, 1 or H / KV * N, K), or None where every key is seen.
-    """
+    prefix_pad: Tensor
+    cache: SegmentKVCache
 
-    cos: Tensor
-    sin: Tensor
-    masks: Sequence[Tensor | None]
+
+class Chunk(NamedTuple):
+    """The two halves of a chunk, for inputs of certain shapes. Geometry goes into one of them, and None into the other."""
+
+    look: Callable[[Observation, GeometryTokens | None], Context]
+    act: Callable[[Context, Tensor, GeometryTokens | None], Tensor]
 
 
 def why_not(network: PI05Pytorch) -> str | None:
@@ -71,10 +76,12 @@ class ChunkRunner:
         if self._weights.stale():
             self._build()
 
+    @torch.inference_mode(False)  # or the joined weights could never again be trained
     @torch.no_grad()
     def _build(self) -> None:
         """Everything that depends on the weights alone."""
         network, dtype = self.network.paligemma_with_expert, self.config.dtype
+        self.device = self.network.action_in_proj.weight.device
         models = {segment: network.segment_model(segment) for segment in Segment}
         fused: dict[int, list[FusedLayer]] = {}
         for model in models.values():
@@ -84,12 +91,12 @@ class ChunkRunner:
         self._layers = {segment: fused[id(model)] for segment, model in models.items()}
         self._steps: dict[int, list[tuple[list[LayerModulation], Modulation]]] = {}
         self._clean = self._modulations(models[Segment.GEOMETRY], 0.0)[0]
+        self._side = SideStream(self.device)
         self._weights = Weights(self.network)
 
     def _modulations(self, model: GemmaModel, time: float) -> tuple[list[LayerModulation], Modulation]:
         """Of every layer of an expert and of its final norm, at one flow time."""
-        device = self.network.action_in_proj.weight.device
-        cond = self.network.embed_time(torch.tensor([time], dtype=torch.float32, device=device))
+        cond = self.network.embed_time(torch.tensor([time], dtype=torch.float32, device=self.device))
 
         def at(norm: nn.Module | Tensor) -> Modulation:
             assert isinstance(norm, AdaRMSNorm)
@@ -106,8 +113,13 @@ class ChunkRunner:
             self._steps[num_steps] = [self._modulations(self._models[Segment.SUFFIX], time) for time in times]
         return self._steps[num_steps]
 
+    def __call__(self, *observation: Any, **kwargs: Any) -> Tensor:
+        """An action chunk (B, S, D) float32 from the weights as they are now; arguments as in `sample`."""
+        self.refresh()
+        return self.sample(*observation, **kwargs)
+
     @torch.no_grad()
-    def __call__(
+    def sample(
         self,
         images: Sequence[Tensor | None],
         img_masks: Sequence[Tensor],
@@ -117,84 +129,110 @@ class ChunkRunner:
         num_steps: int | None = None,
         geom_embs: Tensor | None = None,
         geom_pad: Tensor | None = None,
+        geometry: PendingGeometry | None = None,
     ) -> Tensor:
-        """An action chunk (B, S, D) float32; arguments as in `PI05Pytorch.sample_actions`."""
-        self.refresh()
+        """An action chunk from the weights as they were last looked at; arguments as in `PI05Pytorch.sample_actions`.
+
+        geometry: instead of geom_embs and geom_pad, what measures them once vision and prefix are on their way.
+        """
         if noise is None:
             shape = (tokens.shape[0], self.config.chunk_size, self.config.max_action_dim)
             noise = torch.randn(shape, device=tokens.device)
-        segments, frames, cache = self.prepare(images, img_masks, tokens, masks, noise, geom_embs, geom_pad)
-        self.prefill(Segment.PREFIX, segments, frames, cache)
-        self.prefill(Segment.GEOMETRY, segments, frames, cache)
-        return self.denoise(noise, num_steps or self.config.num_inference_steps, frames, cache)
+        if geom_embs is not None:
+            geometry = PendingGeometry.given(geom_embs, geom_pad)
+        observation = Observation(images, img_masks, tokens, masks)
+        num_tokens = 0 if geometry is None else geometry.num_tokens
+        # None of the caller's autocast: vision and text have their own. It keeps no casts of weights, which are used once, and
+        # which would lie in a recorded graph's memory.
+        with torch.autocast(self.device.type, enabled=False, cache_enabled=False):
+            chunk = self._chunk(observation, noise, num_steps or self.config.num_inference_steps, num_tokens)
+            early = late = None
+            if geometry is not None and self.network.geometry_in_prefix:
+                early = geometry.measure()
+            self._side.begin_here()
+            context = chunk.look(observation, early)
+            if geometry is not None and early is None:
+                late = self._side.run(geometry.measure)
+            return chunk.act(context, noise, late)
 
-    def prepare(
-        self,
-        images: Sequence[Tensor | None],
-        img_masks: Sequence[Tensor],
-        tokens: Tensor,
-        masks: Tensor,
-        noise: Tensor,
-        geom_embs: Tensor | None,
-        geom_pad: Tensor | None,
-    ) -> tuple[list[SegmentTokens | None], dict[Segment, SegmentFrame], SegmentKVCache]:
-        """Vision and text; what is the same in every layer; an empty cache."""
-        with compute_in(self.config.dtype, tokens.device):
-            prefix, geometry = self.network._context(images, img_masks, tokens, masks, geom_embs, geom_pad, None)
-        pad = torch.ones(noise.shape[:2], dtype=torch.bool, device=noise.device)
-        segments = [prefix, geometry, SegmentTokens(None, pad, one_block(noise.shape[1]))]
-        return segments, *self._frames(segments)
+    def _chunk(self, observation: Observation, noise: Tensor, num_steps: int, num_tokens: int) -> Chunk:
+        """How to compute a chunk from such inputs. num_tokens: of geometry."""
+        room = (0 if self.network.geometry_in_prefix else num_tokens, noise.shape[1])
+        return Chunk(partial(self.look, room=room), partial(self.act, num_steps=num_steps))
 
-    def prefill(
-        self,
-        segment: Segment,
-        segments: Sequence[SegmentTokens | None],
-        frames: dict[Segment, SegmentFrame],
-        cache: SegmentKVCache,
-    ) -> None:
-        """Keys and values of prefix or geometry into the cache; nothing for a segment that is not there."""
-        given = segments[segment]
-        if given is None or given.embs is None:
-            return
-        modulations = self._clean if segment is Segment.GEOMETRY else None
-        self._run(segment, given.embs.to(self.config.dtype), frames, cache, modulations, output=False)
+    # --- the two halves, and what they consist of ---------------------------------------------------------------------
 
-    def denoise(
-        self, x_t: Tensor, num_steps: int, frames: dict[Segment, SegmentFrame], cache: SegmentKVCache
-    ) -> Tensor:
+    def look(self, observation: Observation, geometry: GeometryTokens | None, room: tuple[int, int]) -> Context:
+        """Vision, text and prefix; geometry only if it belongs there. room: tokens of the geometry segment and the suffix."""
+        return self.prefill(self.embed(observation, geometry), room)
+
+    def act(self, context: Context, noise: Tensor, geometry: GeometryTokens | None, num_steps: int) -> Tensor:
+        """Actions (B, S, D) from noise of that shape; geometry is None if there is none or the prefix has it."""
+        return self.denoise(context, noise, self.prefill_geometry(context, geometry), num_steps)
+
+    def embed(self, observation: Observation, geometry: GeometryTokens | None = None) -> SegmentTokens:
+        """Vision and text, and the geometry that belongs into the prefix."""
+        with compute_in(self.config.dtype, self.device):
+            prefix = self.network.embed_prefix(*observation)
+            return prefix if geometry is None else prefix.followed_by(self.network.embed_geometry(*geometry))
+
+    def prefill(self, prefix: SegmentTokens, room: tuple[int, int]) -> Context:
+        """The prefix's keys and values in a new cache that has room for the other two segments."""
+        assert prefix.embs is not None
+        batch, length = prefix.pad.shape
+        cache = self.network.paligemma_with_expert.make_cache(batch, (length, *room), prefix.pad.device)
+        frame = self._frame([prefix.pad, None, None], Segment.PREFIX)
+        self._run(Segment.PREFIX, prefix.embs, frame, cache, None, output=False)
+        return Context(prefix.pad, cache)
+
+    def prefill_geometry(self, context: Context, geometry: GeometryTokens | None) -> Tensor | None:
+        """Keys and values of geometry, if there is any, into the cache. Returns its mask."""
+        if geometry is None:
+            return None
+        segment = self.network.embed_geometry(*geometry)
+        assert segment.embs is not None
+        frame = self._frame([context.prefix_pad, segment.pad, None], Segment.GEOMETRY)
+        self._run(Segment.GEOMETRY, segment.embs, frame, context.cache, self._clean, output=False)
+        return segment.pad
+
+    def denoise(self, context: Context, x_t: Tensor, geometry_pad: Tensor | None, num_steps: int) -> Tensor:
         """Integrate the flow from noise x_t (B, S, D) over a filled cache."""
         network, dt = self.network, -1.0 / num_steps
+        suffix_pad = torch.ones(x_t.shape[:2], dtype=torch.bool, device=x_t.device)
+        frame = self._frame([context.prefix_pad, geometry_pad, suffix_pad], Segment.SUFFIX)
         for layers, last in self._schedule(num_steps):
-            embs = network.action_in_proj(x_t).to(self.config.dtype)
-            x = self._run(Segment.SUFFIX, embs, frames, cache, layers, output=True)
-            x_t = torch.add(x_t, network.action_out_proj(_adaptive_norm(x, last)), alpha=dt)
+            x = self._run(Segment.SUFFIX, network.action_in_proj(x_t), frame, context.cache, layers, output=True)
+            x_t = torch.add(x_t, network.action_out_proj(adaptive_norm(x, last)), alpha=dt)
         return x_t
+
+    def _run(
+        self,
+        segment: Segment,
+        embs: Tensor,
+        frame: SegmentFrame,
+        cache: SegmentKVCache,
+        modulations: list[LayerModulation] | None,
+        output: bool,
+    ) -> Tensor:
+        """Embeddings (B, N, W) of a segment through its layers, in the compute dtype."""
+        x, layers = embs.to(self.config.dtype), self._layers[segment]
+        return run_layers(x, layers, self.config.expert, frame, cache, cache.span(segment), modulations, output)
 
     # --- what is the same in every layer ------------------------------------------------------------------------------
 
-    def _frames(self, segments: list[SegmentTokens | None]) -> tuple[dict[Segment, SegmentFrame], SegmentKVCache]:
-        """Positions and masks of all segments, and an empty cache."""
-        pads = [None if s is None else s.pad for s in segments]
-        atts = [None if s is None else s.att for s in segments]
+    def _frame(self, pads: list[Tensor | None], segment: Segment) -> SegmentFrame:
+        """Positions and masks of a segment. pads: (B, N) bool of all segments up to it, None for those that are not there."""
         rule = self.config.geometry.positions if self.config.geometry else "sequential"
-        positions = segment_positions(pads, rule)
-        frames = {}
-        for segment in Segment:
-            place = positions[segment]
-            if place is not None:
-                cos, sin = rotary_table(place, self.config.expert.head_dim)
-                frames[segment] = SegmentFrame(
-                    torch.cat([cos, cos], dim=-1)[:, None],
-                    torch.cat([-sin, sin], dim=-1)[:, None],
-                    self._masks(segment, segment_mask(segment, pads, atts), pads),
-                )
-        lengths = [0 if pad is None else pad.shape[1] for pad in pads]
-        first = pads[Segment.SUFFIX]
-        assert first is not None
-        return frames, self.network.paligemma_with_expert.make_cache(first.shape[0], lengths, first.device)
+        positions = segment_positions(pads, rule)[segment]
+        assert positions is not None
+        cos, sin = rotary_table(positions, self.config.expert.head_dim)
+        cos, sin = torch.cat([cos, cos], dim=-1), torch.cat([-sin, sin], dim=-1)
+        return SegmentFrame(cos[:, None], sin[:, None], self._masks(segment, pads))
 
-    def _masks(self, segment: Segment, seen: Tensor, pads: Sequence[Tensor | None]) -> list[Tensor | None]:
-        """Additive masks of a segment, per layer. seen: (B, 1, K) bool."""
+    def _masks(self, segment: Segment, pads: Sequence[Tensor | None]) -> list[Tensor | None]:
+        """Additive masks of a segment, per layer."""
+        atts = [None if pad is None else one_block(pad.shape[1]) for pad in pads]
+        seen = segment_mask(segment, pads, atts)  # (B, 1, K)
         depth, geometry_pad = self.config.expert.depth, pads[Segment.GEOMETRY]
         gate = self.network.paligemma_with_expert.geometry_gate
         # A float32 mask keeps the gate's digits; CUDA has no fast kernel for one beside bf16 queries.
@@ -212,93 +250,11 @@ class ChunkRunner:
                 rows = bias.unflatten(0, (heads, -1))[:, :, None].expand(-1, -1, queries, -1).flatten(1, 2)
                 masks.append(hidden + rows)
             return masks
-        if seen.device.type == "cpu" and bool(seen.all()):  # on a GPU, to look would be to wait
+        if self._may_look and bool(seen.all()):
             return [None] * depth
         return [hidden] * depth
 
-    # --- layers -------------------------------------------------------------------------------------------------------
-
-    def _run(
-        self,
-        segment: Segment,
-        x: Tensor,
-        frames: dict[Segment, SegmentFrame],
-        cache: SegmentKVCache,
-        modulations: list[LayerModulation] | None,
-        output: bool,
-    ) -> Tensor:
-        """A segment through all layers, keys and values into the cache; without `output` the last one stops there."""
-        frame, layers, span = frames[segment], self._layers[segment], cache.span(segment)
-        for index, weights in enumerate(layers):
-            modulation = None if modulations is None else modulations[index]
-            keys, values = cache.keys[index], cache.values[index]
-            last = not output and index == len(layers) - 1
-            queries = self._attention_inputs(x, weights, frame, modulation, keys, values, span, last)
-            if queries is None:
-                break
-            seen_keys, seen_values = keys[:, :, : span.stop], values[:, :, : span.stop]
-            attended = _attend(queries, seen_keys, seen_values, frame.masks[index])  # (B, KV, H / KV * N, D)
-            heads = attended.unflatten(2, (-1, x.shape[1])).flatten(1, 2)  # (B, H, N, D)
-            update = F.linear(heads.transpose(1, 2).flatten(2), weights.out)
-            x = _add(x, update, modulation, 0)
-            gate, up = F.linear(_norm(x, weights.post_norm, modulation, 1), weights.gate_up).chunk(2, dim=-1)
-            x = _add(x, F.linear(F.gelu(gate, approximate="tanh").mul_(up), weights.down), modulation, 1)
-        return x
-
-    def _attention_inputs(
-        self,
-        x: Tensor,
-        weights: FusedLayer,
-        frame: SegmentFrame,
-        modulation: LayerModulation | None,
-        keys: Tensor,
-        values: Tensor,
-        span: slice,
-        keys_only: bool,
-    ) -> Tensor | None:
-        """Write the segment's keys and values to the cache; return its queries (B, KV, H / KV * N, D)."""
-        expert = self.config.expert
-        kv = expert.num_kv_heads
-        heads = 0 if keys_only else expert.num_heads
-        matrix = weights.qkv[expert.num_heads * expert.head_dim :] if keys_only else weights.qkv
-        projected = F.linear(_norm(x, weights.norm, modulation, 0), matrix)
-        projected = projected.unflatten(-1, (-1, expert.head_dim)).transpose(1, 2)  # (B, heads + 2 KV, N, D)
-        turned = _rotate(projected[:, : heads + kv], frame.cos, frame.sin)
-        keys[:, :, span].copy_(turned[:, heads:])
-        values[:, :, span].copy_(projected[:, heads + kv :])
-        if keys_only:
-            return None
-        return turned[:, :heads].to(x.dtype).unflatten(1, (kv, -1)).flatten(2, 3)
-
-
-def _attend(queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
-    """softmax(q k^T / sqrt(D) + mask) v, by whichever way is faster (benchmarks/attention.py)."""
-    if queries.device.type != "cpu" or queries.dtype != torch.bfloat16:
-        return F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
-    scores = torch.matmul(queries * queries.shape[-1] ** -0.5, keys.transpose(-1, -2)).float()
-    if mask is not None:
-        scores += mask
-    return torch.matmul(scores.softmax(dim=-1).to(queries.dtype), values)
-
-
-def _rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """Rotary positions of x (B, heads, N, D), in float32; sin has the sign of its half."""
-    x = x.float()
-    first, second = x.chunk(2, dim=-1)
-    return torch.addcmul(x * cos, torch.cat([second, first], dim=-1), sin)
-
-
-def _norm(x: Tensor, scale: Tensor | None, modulation: LayerModulation | None, which: int) -> Tensor:
-    if modulation is not None:
-        return _adaptive_norm(x, modulation[which])
-    assert scale is not None
-    return (F.rms_norm(x.float(), (x.shape[-1],), None, RMS_EPS) * scale).to(x.dtype)
-
-
-def _adaptive_norm(x: Tensor, modulation: Modulation) -> Tensor:
-    normed = F.rms_norm(x.float(), (x.shape[-1],), None, RMS_EPS)
-    return torch.addcmul(modulation.shift, normed, modulation.scale).to(x.dtype)
-
-
-def _add(x: Tensor, update: Tensor, modulation: LayerModulation | None, which: int) -> Tensor:
-    return x + update if modulation is None else torch.addcmul(x, update, modulation[which].gate)
+    @property
+    def _may_look(self) -> bool:
+        """Whether values may be looked at: on a GPU, to look is to wait."""
+        return self.device.type == "cpu"

@@ -1,18 +1,20 @@
 """Which way a chunk is computed: by the runner, or by the plain path where the runner is not wanted or does not apply."""
 
 import logging
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from .config import RunnerName
+from .graphs import PROMPT_STEP, GraphRunner
 from .pi05 import PI05Pytorch
 from .runner import ChunkRunner, why_not
+from .side_stream import PendingGeometry
 
 logger = logging.getLogger(__name__)
 
-RunnerName = Literal["fast", "plain"]
-_KNOWN_TO_RUNNER = {"noise", "num_steps", "geom_embs", "geom_pad"}
+_KNOWN_TO_RUNNER = {"noise", "num_steps", "geom_embs", "geom_pad", "geometry"}
 
 
 class ChunkSampler:
@@ -20,25 +22,40 @@ class ChunkSampler:
 
     def __init__(self, network: PI05Pytorch) -> None:
         self._network = network
-        self._runner: ChunkRunner | None = None
+        self._runners: dict[type[ChunkRunner], ChunkRunner] = {}
         self._declined: str | None = None
 
+    def __reduce__(self) -> tuple:
+        """A copy builds its own runner: recorded graphs have no copies."""
+        return ChunkSampler, (self._network,)
+
     def __call__(self, *observation: Any, runner: RunnerName = "fast", **kwargs: Any) -> Tensor:
-        """An action chunk (B, S, D); observation and kwargs as in `PI05Pytorch.sample_actions`."""
+        """An action chunk (B, S, D); observation and kwargs as in `ChunkRunner.sample` or `PI05Pytorch.sample_actions`."""
         given = {name: value for name, value in kwargs.items() if value is not None}
         if runner == "plain":
-            return self._network.sample_actions(*observation, **given)
-        declined = self._why_not(set(given))
+            return self._plainly(*observation, **given)
+        declined = self._why_not(runner, set(given))
         if declined is not None:
             if declined != self._declined:
                 logger.warning("The plain path computes the actions, since %s.", declined)
             self._declined = declined
-            return self._network.sample_actions(*observation, **given)
+            return self._plainly(*observation, **given)
         self._declined = None
-        assert self._runner is not None
-        return self._runner(*observation, **given)
+        return self._runners[self._class(runner)].sample(*observation, **given)
 
-    def _why_not(self, given: set[str]) -> str | None:
+    def _plainly(self, *observation: Any, geometry: PendingGeometry | None = None, **given: Any) -> Tensor:
+        if geometry is not None:
+            given["geom_embs"], given["geom_pad"] = geometry.measure()
+        return self._network.sample_actions(*observation, **given)
+
+    @property
+    def _device(self) -> torch.device:
+        return self._network.action_in_proj.weight.device
+
+    def _class(self, runner: RunnerName) -> type[ChunkRunner]:
+        return GraphRunner if runner == "fast" and self._device.type == "cuda" else ChunkRunner
+
+    def _why_not(self, runner: RunnerName, given: set[str]) -> str | None:
         """Why the runner cannot serve this call; builds it if it can."""
         network = self._network
         if network.rtc_processor is not None and network.rtc_processor.rtc_config.enabled:
@@ -49,18 +66,23 @@ class ChunkSampler:
         reason = why_not(network)
         if reason is not None:
             return reason
+        wanted = self._class(runner)
+        # One that was built where the network is no longer would keep that device's memory.
+        self._runners = {kind: built for kind, built in self._runners.items() if built.device == self._device}
         try:
-            if self._runner is None:
-                self._runner = ChunkRunner(network)
-            self._runner.refresh()
+            if wanted not in self._runners:
+                self._runners[wanted] = wanted(network)
+            self._runners[wanted].refresh()
         except TypeError as error:
-            self._runner = None
+            self._runners.clear()
             return str(error)
         return None
 
-    def explain(self) -> dict[str, str]:
-        """What is active and what was declined, and why, for a person to read."""
-        reason = self._why_not(set())
+    def explain(self, runner: RunnerName = "fast") -> dict[str, str]:
+        """What is active and what was declined, and why, for a person to read. runner: the one that is asked for."""
+        if runner == "plain":
+            return {"runner": "declined: inference_runner=plain; the plain path serves"}
+        reason = self._why_not(runner, set())
         if reason is not None:
             return {"runner": f"declined: {reason}; the plain path serves"}
         network = self._network
@@ -68,7 +90,7 @@ class ChunkSampler:
             layer.self_attn.q_proj.weight.dtype == network.config.dtype
             for layer in network.paligemma_with_expert.expert.layers
         )
-        on_cpu = network.action_in_proj.weight.device.type == "cpu"
+        on_cpu = self._device.type == "cpu"
         written_out = on_cpu and network.config.dtype == torch.bfloat16
         return {
             "runner": "active",
@@ -78,7 +100,25 @@ class ChunkSampler:
             "attention": "written-out products (measured: faster on a CPU in bf16)" if written_out else "SDPA",
             "last VLM layer": "stops at keys and values",
             "cameras": "one vision batch, absent ones not encoded",
+            "geometry": self._explain_geometry(),
             "real-time chunking": "declined: the plain path serves it",
-            "CUDA graphs": "not built yet",
-            "compilation": "not built yet",
+            **self._explain_graphs(runner),
+            "compilation": "left out: on a CPU chunks were no faster for it (docs/results.md); on a GPU it has not been measured",
         }
+
+    def _explain_geometry(self) -> str:
+        if self._network.config.geometry is None:
+            return "none"
+        if self._network.geometry_in_prefix:
+            return "measured before the prefix, which it is part of"
+        if self._device.type == "cuda":
+            return "measured on a side stream, beside vision and prefix"
+        return f"measured after the prefix: a {self._device.type} has no streams"
+
+    def _explain_graphs(self, runner: RunnerName) -> dict[str, str]:
+        active = self._runners[self._class(runner)]
+        if isinstance(active, GraphRunner):
+            state = f"active: {len(active.recorded)} of at most {active.capacity} shapes of inputs recorded"
+            return {"CUDA graphs": state, "prompt": f"padded to a multiple of {PROMPT_STEP} tokens, one graph each"}
+        why = "inference_runner=eager" if self._device.type == "cuda" else f"a {self._device.type} has none"
+        return {"CUDA graphs": f"declined: {why}", "prompt": "as long as the longest of the batch"}
