@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.network import build, fill, inputs
+from benchmarks.network import parts as lerobot_parts
 from lerobot_policy_pi05_geometry.geometry import GeometryEncoder
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS, Da3Backbone, Da3Encoder, Da3Source
 from lerobot_policy_pi05_geometry.geometry.da3.encoder import store_products_in
@@ -142,8 +143,11 @@ def far(args: argparse.Namespace, cameras: int, ours: PI05Pytorch) -> float:
     return ((fast - plain).norm() / plain.norm()).item()
 
 
-def split(args: argparse.Namespace, cameras: int, ours: PI05Pytorch) -> dict[str, float]:
-    """Where the runner's time goes without graphs: medians of its parts and all denoising steps, in seconds."""
+def split(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) -> tuple[dict[str, float], float | None]:
+    """Where the runner's time goes without graphs: medians of its parts and all denoising steps, in seconds.
+
+    Then, on a CPU, a denoising step over one of LeRobot's.
+    """
     (observation, noise), runner = observe(args, cameras, args.prompt), ChunkRunner(ours)
     embs = geometry_tokens(args, ours)
     geometry = GeometryTokens(embs, torch.ones(embs.shape[:2], dtype=torch.bool, device=embs.device))
@@ -154,12 +158,20 @@ def split(args: argparse.Namespace, cameras: int, ours: PI05Pytorch) -> dict[str
         times[part].append(seconds(lambda: result.append(run()), args.device))
         return result[0]
 
+    steps = ours.config.num_inference_steps
+    on_cpu = args.device == "cpu"
+    settings = argparse.Namespace(**{**vars(args), "cameras": cameras})
+    theirs = lerobot_parts(EAGER, lerobot, settings)["denoise step"] if on_cpu else None
+    ratios = []
     for _ in range(args.rounds + 1):
         prefix = timed("vision and text", partial(runner.embed, observation))
         context = timed("prefix", partial(runner.prefill, prefix, (args.geometry_tokens, noise.shape[1])))
         pad = timed("geometry", partial(runner.prefill_geometry, context, geometry))
-        timed("denoising", partial(runner.denoise, context, noise, pad, ours.config.num_inference_steps))
-    return {part: statistics.median(values[1:]) for part, values in times.items()}
+        timed("denoising", partial(runner.denoise, context, noise, pad, steps))
+        if theirs is not None:
+            ratios.append(times["denoising"][-1] / steps / min(seconds(theirs, args.device) for _ in range(2)))
+    parts = {part: statistics.median(values[1:]) for part, values in times.items()}
+    return parts, statistics.median(ratios[1:]) if ratios else None
 
 
 def trace(args: argparse.Namespace, cameras: int, functions: dict[str, Callable[[], Tensor]]) -> None:
@@ -221,9 +233,12 @@ def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) 
         }
     if args.trace:
         trace(args, cameras, functions)
-    parts, least = split(args, cameras, ours), floor(args, cameras, ours)
+    parts, step = split(args, cameras, ours, lerobot)
+    least = floor(args, cameras, ours)
     with_geometry = statistics.median(a / b for a, b in zip(times[GEOMETRY], times[PLAIN], strict=True))
     ratios = {"geometry over no geometry": with_geometry}
+    if step is not None:
+        ratios["step over LeRobot's"] = step
     for name, (one, other) in PAIRS.items():
         if one in times and other in times:
             ratios[name] = statistics.median(a / b for a, b in zip(times[one], times[other], strict=True))
@@ -267,9 +282,12 @@ def main() -> None:
     ours = build(GEOMETRY, one, lerobot).to(args.device)
     lerobot.to(args.device)
     machine = f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads"
+    size, theirs = (sum(p.nbytes for p in network.parameters()) for network in (ours, lerobot))
+    print(f"weights {size / 2**30:.2f} GiB, {size / theirs:.2f} of LeRobot's")
     summary: dict = {
         "machine": torch.cuda.get_device_name() if args.device != "cpu" else machine,
         "settings": {name: value for name, value in vars(args).items() if name not in ("output", "trace")},
+        "weights over LeRobot's": size / theirs,
     }
     for cameras in args.cameras:
         found = measure(args, cameras, ours, lerobot)
@@ -278,7 +296,7 @@ def main() -> None:
         for arm, row in found["arms"].items():
             shown = f"p50 {row['p50_ms']:9.1f} ms   p95 {row['p95_ms']:9.1f} ms   first {row['first_s']:6.1f} s"
             print(f"  {arm:20} {shown}   ratio {row['ratio']:.2f}")
-        for name in ("geometry over no geometry", *PAIRS, "chunk over floor", "far"):
+        for name in ("geometry over no geometry", "step over LeRobot's", *PAIRS, "chunk over floor", "far"):
             if name in found:
                 print(f"  {name} {found[name]:.3g}")
         for name in ("split_ms", "floor_ms"):
