@@ -1,0 +1,107 @@
+"""The command: what it prints, what it refuses, and that it takes seconds and no memory at the released size."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+from lerobot_policy_pi05_geometry.cli import app
+from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
+from lerobot_policy_pi05_geometry.planner.options import da3_variant
+
+TINY = ["--policy.paligemma_variant=tiny", "--policy.action_expert_variant=tiny", "--policy.image_resolution=[28,28]"]
+
+
+def plan(*arguments: str) -> str:
+    result = CliRunner().invoke(app, ["plan", *arguments], env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output + repr(result.exception)
+    return " ".join(result.output.split())
+
+
+def refused(*arguments: str) -> str:
+    result = CliRunner().invoke(app, ["plan", *TINY, *arguments])
+    assert result.exit_code == 1
+    assert isinstance(result.exception, ValueError | FileNotFoundError)
+    return str(result.exception)
+
+
+def test_training_and_inference_side_by_side():
+    shown = plan(*TINY, "--explain", "--image-size", "60x80", "--cameras", "3")
+    for word in (
+        "weights",
+        "gradients",
+        "optimiser",
+        "activations",
+        "cache",
+        "peak",
+        "GPU needed",
+        "training",
+        "inference",
+    ):
+        assert word in shown
+    assert "60 x 80, 60 x 80, 60 x 80" in shown
+
+
+def test_proposals_with_the_command_that_trains_them():
+    shown = plan(*TINY, "--gpu", "8", "--batch_size", "4")
+    assert "full fine-tuning" in shown
+    assert "1. lerobot-train --policy.type=pi05_geometry --policy.dtype=bfloat16" in shown
+    assert "--batch_size=4" in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--gpu", "0.01"], "Nothing fits 0.0 GiB"),
+        (["--gpu", "banana"], "'banana' is no GPU the planner knows"),
+        (["--gpu", "24", "--policy.train_expert_only=true", "--lora", "all"], "leave no recipe to try"),
+        (["--lora", "everything"], "--lora must be one of expert, all"),
+        (["--optimizer", "lion"], "knows the optimisers adamw and adamw8bit"),
+        (["--policy.speed=3"], "--policy.speed is no setting of this policy"),
+        (["--steps=3"], "'--steps=3' is no option of this command"),
+        (["--policy.type=act"], "--policy.type=pi05_geometry only"),
+        (["--policy.dtype=float8"], "--policy.dtype must be one of"),
+        (["--policy.chunk_size=many"], "A setting of the policy cannot be read"),
+        (["--image-size", "big"], "height x width"),
+        (["--policy.path=/nowhere"], "/nowhere"),
+        (["--policy.geometry_source=da3", "--policy.da3_encoder=other/model"], "does not know the size of the encoder"),
+    ],
+)
+def test_one_sentence_for_what_cannot_be(arguments, message):
+    assert message in refused(*arguments)
+
+
+def test_a_checkpoints_own_settings(tmp_path):
+    from lerobot_policy_pi05_geometry.configuration_pi05_geometry import PI05GeometryConfig
+    from tests.doors import make_config
+
+    make_config(geometry_source="random")._save_pretrained(tmp_path)
+    assert json.loads((tmp_path / "config.json").read_text())["type"] == PI05GeometryConfig.get_choice_name(
+        PI05GeometryConfig
+    )
+    assert "weights" in plan(f"--policy.path={tmp_path}")
+    assert "30 x 40, 28 x 28" in plan(f"--policy.path={tmp_path}", "--explain", "--policy.chunk_size=9")
+
+
+@pytest.mark.parametrize("name", [n for n in VARIANTS if n != "tiny"])
+def test_encoders_by_their_released_names(name):
+    assert da3_variant(f"depth-anything/DA3-{name.upper()}") is VARIANTS[name]
+    assert da3_variant("depth-anything/DA3METRIC-LARGE").name == "mono-large"
+
+
+@pytest.mark.slow
+def test_the_released_size_in_seconds_and_without_memory():
+    """Peak resident set below 2 GiB, of which PyTorch and LeRobot have some 0.8, for a model of 12.5."""
+    program = (
+        "import sys; sys.argv = ['pi05-geometry', 'plan', '--policy.dtype=bfloat16'];"
+        "from lerobot_policy_pi05_geometry.cli import app; app(standalone_mode=False);"
+        "import time; print('HWM', next(l.split()[1] for l in open('/proc/self/status') if l.startswith('VmHWM')),"
+        "time.process_time())"
+    )
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=600)
+    resident, seconds = result.stdout.split("HWM ")[1].split()
+    assert float(seconds) < 60
+    assert "12.50" in result.stdout
+    assert int(resident) < 2 * 2**20

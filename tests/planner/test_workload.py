@@ -1,0 +1,188 @@
+"""Predicted bytes: equal to those that are there, and moving the way they must."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.profiler import ProfilerActivity, profile
+
+from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
+from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
+from lerobot_policy_pi05_geometry.planner.counting import storage_bytes
+from lerobot_policy_pi05_geometry.planner.lora import LoraPlan
+from lerobot_policy_pi05_geometry.planner.workload import FakePolicy, Load
+from tests.doors import TOKENS, make_batch, make_config, without
+
+PROMPT = make_batch()[TOKENS].shape[1]
+SETTINGS = [
+    {},
+    {"gradient_checkpointing": True},
+    {"train_expert_only": True},
+    {"freeze_vision_encoder": True, "gradient_checkpointing": True},
+    {"geometry_source": "none"},
+    {"geometry_source": "random", "flow_samples": 3},
+    {"geometry_time": "denoise", "flow_samples": 2},
+    {"geometry_expert": "own"},
+    {"dtype": "bfloat16"},
+    {"dtype": "bfloat16", "gradient_checkpointing": True},
+    {"dtype": "bfloat16", "param_dtype": "bfloat16"},
+]
+
+
+def load(size: int, **changes) -> Load:
+    return Load(**{"batch_size": size, "prompt_tokens": PROMPT, "target": "cpu"} | changes)
+
+
+def fake(lora: LoraPlan | None = None, **changes) -> FakePolicy:
+    return FakePolicy(make_config(**changes), lora)
+
+
+def allocated(run) -> int:
+    """What PyTorch's allocator holds at most while this runs, above what it held before."""
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
+        run()
+    events = [e for e in profiler.profiler.kineto_results.events() if e.name() == "[memory]"]
+    now = highest = 0
+    for event in sorted(events, key=lambda e: e.start_ns()):
+        now += event.nbytes()
+        highest = max(highest, now)
+    return highest
+
+
+def real(size: int, **changes) -> tuple[PI05GeometryPolicy, dict]:
+    """A policy and a batch as `FakePolicy` has them, which knows nothing of an index."""
+    policy = PI05GeometryPolicy(make_config(**changes))
+    batch = without(make_batch(size), "task", "index")
+    return policy, batch
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_training_equals_the_allocator(settings):
+    """The whole step of the real policy, its optimiser's too, to 2 %: drawing and logging are not predicted."""
+    policy, batch = real(6, **settings)
+    policy.train()
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+
+    def step() -> None:
+        policy.forward(batch)[0].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    step()
+    states = [tensor for state in optimizer.state.values() for tensor in state.values()]
+    before = storage_bytes([*policy.parameters(), *policy.buffers(), *batch.values(), *states])
+    assert fake(**settings).training(load(6)).total == pytest.approx(before + allocated(step), rel=0.02)
+
+
+@pytest.mark.parametrize("settings", [s for s in SETTINGS if "flow_samples" not in s], ids=str)
+def test_inference_equals_the_allocator(settings):
+    """The plain path's, to 2 % and the memory in which the CPU's convolution puts its weights into another order."""
+    policy, batch = real(16, **settings)
+    del batch["action"]
+    before = storage_bytes([*policy.parameters(), *policy.buffers(), *batch.values()])
+    policy.predict_action_chunk(batch, runner="plain")
+    measured = before + allocated(lambda: policy.predict_action_chunk(batch, runner="plain"))
+    predicted, convolution = fake(**settings).inference(load(16)).total, 4 * 32 * 3 * 14**2
+    assert 0.98 * (measured - convolution) <= predicted <= 1.02 * measured
+
+
+@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+def test_weights_gradients_and_optimiser_are_exact(settings):
+    policy, batch = real(2, **settings)
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    policy.train().forward(batch)[0].backward()
+    gradients = [p.grad for p in policy.parameters() if p.grad is not None]
+    optimizer.step()
+    moments = [t for state in optimizer.state.values() for name, t in state.items() if name != "step"]
+    planned = fake(**settings)
+    split = planned.training(load(2))
+    assert split.weights == planned.weights() == storage_bytes([*policy.parameters(), *policy.buffers()])
+    assert split.optimiser == storage_bytes(moments)
+    resident = planned.resident(load(2))
+    assert (resident.gradients, resident.optimiser) == (storage_bytes(gradients), storage_bytes(moments))
+
+
+@given(st.integers(1, 6), st.integers(1, 6), st.sampled_from(SETTINGS), st.sampled_from(["cpu", "cuda"]))
+def test_more_samples_need_more(size, more, settings, target):
+    planned = fake(**settings)
+    less, most = (planned.training(load(n, target=target)) for n in (size, size + more))
+    assert less.total < most.total
+    assert less.optimiser == most.optimiser
+    assert (
+        planned.inference(load(size, target=target)).total < planned.inference(load(size + more, target=target)).total
+    )
+
+
+@given(st.integers(4, 16), st.booleans())
+def test_checkpointing_lowers_activations(size, bf16):
+    dtype = {"dtype": "bfloat16" if bf16 else "float32"}
+    kept, recomputed = (fake(gradient_checkpointing=on, **dtype).training(load(size)) for on in (False, True))
+    assert recomputed.activations < 0.8 * kept.activations
+    assert recomputed.optimiser == kept.optimiser
+
+
+def test_what_is_frozen_has_no_gradient_and_no_state():
+    whole, part = (fake(train_expert_only=only) for only in (False, True))
+    frozen = sum(p.nbytes for n, p in whole.policy.named_parameters() if "paligemma.model" in n and p.requires_grad)
+    before, after = whole.resident(load(1)), part.resident(load(1))
+    assert (before.gradients - after.gradients, before.optimiser - after.optimiser) == (frozen, 2 * frozen)
+    assert before.weights == after.weights
+    assert part.training(load(8)).gradients <= after.gradients
+
+
+def test_inference_has_neither_gradients_nor_optimiser():
+    config = make_config(chunk_size=400)  # so long that denoising is the largest moment, with the cache there
+    split = FakePolicy(config).inference(load(2))
+    assert (split.gradients, split.optimiser, split.da3) == (0, 0, 0)
+    expert, tokens = config.network().expert, 2 * 4 + PROMPT + 2 * 9 + config.chunk_size  # two cameras of 2 x 2 patches
+    assert split.cache == 2 * expert.depth * 2 * expert.num_kv_heads * tokens * expert.head_dim * 4
+
+
+def test_micro_batches_need_what_one_needs_and_the_gradients():
+    planned = fake(geometry_source="random")
+    whole, small = (planned.training(load(size)) for size in (16, 2))
+    micro = planned.training(load(16, micro_batch_size=2))
+    assert small.total < micro.total < whole.total
+    gradients, batch = planned.resident(load(2)).gradients, without(make_batch(16), "task", "index")
+    assert micro.total <= small.total + gradients + storage_bytes(batch.values())
+    assert planned.training(load(16, micro_batch_size=16)) == planned.training(load(16, micro_batch_size=99)) == whole
+
+
+def test_8_bits_lower_the_state():
+    planned = fake()
+    full, eight = (planned.training(load(2, optimizer=name)) for name in ("adamw", "adamw8bit"))
+    assert eight.optimiser < full.optimiser
+    with pytest.raises(ValueError, match="knows the optimisers adamw and adamw8bit, not 'sgd'"):
+        planned.training(load(2, optimizer="sgd"))
+
+
+def test_depth_anything_has_a_purpose_of_its_own():
+    config = make_config(geometry_source="da3", calibration={}, da3_image_size=42)
+    planned = FakePolicy(config, None, VARIANTS["tiny"])
+    encoder = planned.policy.geometry.source.encoder
+    expected = storage_bytes([*encoder.parameters(), *encoder.buffers()])
+    assert planned.training(load(2)).da3 == planned.inference(load(2)).da3 == expected > 0
+    assert planned.training(load(2)).weights == planned.weights()
+
+
+def test_on_cuda_pure_bf16_layer_norms_are_float32():
+    """As CUDA's autocast has it, and the CPU's has not: what the vision tower remembers grows."""
+    settings = {"dtype": "bfloat16", "param_dtype": "bfloat16"}
+    planned = fake(**settings)
+    norms = 2 * 2 + 1  # layers of `tiny`'s vision tower
+    seen = 8 * 2 * 4 * 32  # samples, cameras, patches, width
+    cuda, cpu = (planned.training(load(8, target=target)).activations for target in ("cuda", "cpu"))
+    assert cuda - cpu > 0.5 * norms * 2 * seen
+    plain = fake(
+        dtype="bfloat16"
+    )  # there, the residual stream is float32 already, and blocks of 512 bytes are what is left
+    assert plain.training(load(8, target="cuda")).total < 1.2 * plain.training(load(8, target="cpu")).total
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("case", range(3))
+def test_on_a_gpu_within_ten_percent(case):
+    from benchmarks.planner import GPU_CASES, make_config, measure, predict
+
+    what, size, settings = [c for c in GPU_CASES if c[2].get("train_expert_only") or c[0] == "inference"][case]
+    measured = measure(what, size, make_config(settings, gpu=True), gpu=True)["bytes"]
+    assert predict(what, size, make_config(settings, gpu=True), gpu=True).total == pytest.approx(measured, rel=0.1)
