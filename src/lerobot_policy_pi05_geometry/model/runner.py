@@ -19,6 +19,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
+from torch.utils._pytree import tree_leaves
 
 from .attention import rotary_table
 from .cache import SegmentKVCache
@@ -85,6 +86,12 @@ class ChunkRunner:
         self._steps: dict[int, list[tuple[list[LayerModulation], Modulation]]] = {}
         self._clean = self._modulations(models[Segment.GEOMETRY], 0.0)[0]
         self._weights = Weights(self.network)
+
+    def tensors(self) -> list[Tensor]:
+        """All that is kept between chunks; some of it is the network's own storage (fused.py)."""
+        leaves = tree_leaves([self._clean, *self._steps.values()])
+        matrices = (m for layers in self._layers.values() for layer in layers for m in vars(layer).values())
+        return [tensor for tensor in (*matrices, *leaves) if isinstance(tensor, Tensor)]
 
     def _modulations(self, model: GemmaModel, time: float) -> tuple[list[LayerModulation], Modulation]:
         """Of every layer of an expert and of its final norm, at one flow time."""
@@ -198,7 +205,7 @@ class ChunkRunner:
         depth, geometry_pad = self.config.expert.depth, pads[Segment.GEOMETRY]
         gate = self.network.paligemma_with_expert.geometry_gate
         # A float32 mask keeps the gate's digits; CUDA has no fast kernel for one beside bf16 queries.
-        dtype = torch.float32 if seen.device.type == "cpu" else self.config.dtype
+        dtype = torch.float32 if self._kernels(seen) == "cpu" else self.config.dtype
         hidden = torch.zeros(seen.shape, dtype=dtype, device=seen.device).masked_fill(~seen, torch.finfo(dtype).min)
         hidden = hidden[:, None]  # (B, 1, 1, K)
         if segment is Segment.SUFFIX and gate is not None and geometry_pad is not None:
@@ -212,9 +219,15 @@ class ChunkRunner:
                 rows = bias.unflatten(0, (heads, -1))[:, :, None].expand(-1, -1, queries, -1).flatten(1, 2)
                 masks.append(hidden + rows)
             return masks
-        if seen.device.type == "cpu" and bool(seen.all()):  # on a GPU, to look would be to wait
-            return [None] * depth
-        return [hidden] * depth
+        return [None if self._hides_nothing(seen) else hidden] * depth
+
+    def _hides_nothing(self, seen: Tensor) -> bool:
+        """Whether a segment needs no mask."""
+        return self._kernels(seen) == "cpu" and bool(seen.all())  # on a GPU, to look would be to wait
+
+    def _kernels(self, tensor: Tensor) -> str:
+        """Type of the device whose kernels decide how things are computed."""
+        return tensor.device.type
 
     # --- layers -------------------------------------------------------------------------------------------------------
 
@@ -237,7 +250,7 @@ class ChunkRunner:
             if queries is None:
                 break
             seen_keys, seen_values = keys[:, :, : span.stop], values[:, :, : span.stop]
-            attended = _attend(queries, seen_keys, seen_values, frame.masks[index])  # (B, KV, H / KV * N, D)
+            attended = self._attend(queries, seen_keys, seen_values, frame.masks[index])  # (B, KV, H / KV * N, D)
             heads = attended.unflatten(2, (-1, x.shape[1])).flatten(1, 2)  # (B, H, N, D)
             update = F.linear(heads.transpose(1, 2).flatten(2), weights.out)
             x = _add(x, update, modulation, 0)
@@ -270,15 +283,14 @@ class ChunkRunner:
             return None
         return turned[:, :heads].to(x.dtype).unflatten(1, (kv, -1)).flatten(2, 3)
 
-
-def _attend(queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
-    """softmax(q k^T / sqrt(D) + mask) v, by whichever way is faster (benchmarks/attention.py)."""
-    if queries.device.type != "cpu" or queries.dtype != torch.bfloat16:
-        return F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
-    scores = torch.matmul(queries * queries.shape[-1] ** -0.5, keys.transpose(-1, -2)).float()
-    if mask is not None:
-        scores += mask
-    return torch.matmul(scores.softmax(dim=-1).to(queries.dtype), values)
+    def _attend(self, queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
+        """softmax(q k^T / sqrt(D) + mask) v, by whichever way is faster (benchmarks/attention.py)."""
+        if self._kernels(queries) != "cpu" or queries.dtype != torch.bfloat16:
+            return F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+        scores = torch.matmul(queries * queries.shape[-1] ** -0.5, keys.transpose(-1, -2)).float()
+        if mask is not None:
+            scores += mask
+        return torch.matmul(scores.softmax(dim=-1).to(queries.dtype), values)
 
 
 def _rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:

@@ -51,12 +51,15 @@ class ChunkSampler:
             return reason
         try:
             if self._runner is None:
-                self._runner = ChunkRunner(network)
+                self._runner = self._make_runner()
             self._runner.refresh()
         except TypeError as error:
             self._runner = None
             return str(error)
         return None
+
+    def _make_runner(self) -> ChunkRunner:
+        return ChunkRunner(self._network)
 
     def explain(self) -> dict[str, str]:
         """What is active and what was declined, and why, for a person to read."""

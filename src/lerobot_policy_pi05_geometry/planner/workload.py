@@ -9,11 +9,11 @@ keeps its output and one number per query. What CUDA's autocast does otherwise i
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from accelerate import init_empty_weights
-from lerobot.policies.common.vla_utils import pad_vector
 from torch import Tensor
 from torch._subclasses import FakeTensorMode
 from torch.overrides import TorchFunctionMode
@@ -22,15 +22,15 @@ from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..geometry.da3 import Da3Backbone, Da3Encoder, Da3Source, Da3Variant
 from ..geometry.da3.encoder import store_products_in
 from ..geometry.keys import is_geometry_key
-from ..inputs import prepare_images
-from ..model.precision import DTYPES, compute_in_float32
-from ..modeling_pi05_geometry import PI05GeometryPolicy
+from ..micro_batches import rows_of, sum_of
+from ..model.precision import DTYPES
+from .acting import CountedSampler, Target
+from .adapters import add_lora
 from .counting import CUDA_BLOCK, MemoryCounter, MemorySplit, storage_bytes
-from .lora import LoraPlan, add_lora
-from .optimisers import step_bytes
+from .optimisers import rounded, step_bytes
+from .planned import PlannedPolicy
 
 CPU = torch.device("cpu")
-Target = Literal["cuda", "cpu"]
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,14 @@ class Load:
     """What is asked of the policy at once.
 
     batch_size: samples of a training step, or observations of a prediction. micro_batch_size: samples whose activations
-    live at the same time, None for all. prompt_tokens: padded length of the prompts. optimizer: its name in `optimisers.py`.
-    lora: low-rank adapters, None for none. target: whose kernels, autocast and allocator are assumed.
+    live at the same time, None or 0 for all. prompt_tokens: padded length of the prompts. optimizer: as in the policy's
+    configuration. target: whose kernels, autocast and allocator are assumed.
     """
 
     batch_size: int = 1
     micro_batch_size: int | None = None
     prompt_tokens: int = 200
     optimizer: str = "adamw"
-    lora: LoraPlan | None = None
     target: Target = "cuda"
 
     @property
@@ -76,18 +75,21 @@ class CudaAutocast(TorchFunctionMode):
 class FakePolicy:
     """A policy of this configuration on fake tensors, ready to be counted.
 
-    config: features included; its calibration must be complete, as for a real policy. da3: the encoder's size, for
-    geometry_source=da3.
+    config: features included; its calibration must be complete, as for a real policy. lora_rank: rank of LoRA on the
+    configuration's `lora_targets`, None for none. da3: the encoder's size, for geometry_source=da3 and features. With
+    features the policy can be trained; for inference, where it looks live, plan one with geometry_source=da3.
     """
 
-    def __init__(self, config: PI05GeometryConfig, lora: LoraPlan | None = None, da3: Da3Variant | None = None) -> None:
+    def __init__(
+        self, config: PI05GeometryConfig, lora_rank: int | None = None, da3: Da3Variant | None = None
+    ) -> None:
         config.device = "cpu"
         self._steps: dict[Load, _Step] = {}
         self.mode = FakeTensorMode(allow_non_fake_inputs=True)
         encoder = None
-        if config.geometry_source == "da3":
+        if config.geometry_source in ("da3", "features"):
             if da3 is None:
-                raise ValueError("geometry_source=da3 needs the encoder's size to be planned.")
+                raise ValueError(f"geometry_source={config.geometry_source} needs the encoder's size to be planned.")
             with torch.device("meta"):
                 backbone = Da3Backbone(da3)
             store_products_in(backbone, DTYPES[config.da3_dtype])
@@ -95,11 +97,12 @@ class FakePolicy:
             with self.mode:
                 encoder.to_empty(device=CPU)
         with init_empty_weights(include_buffers=False):
-            self.policy = PI05GeometryPolicy(config, encoder=encoder)
+            self.policy = PlannedPolicy(config, encoder=encoder)
+        if lora_rank is not None:
+            with torch.device("meta"):
+                add_lora(self.policy, lora_rank)
         with self.mode:
             self.policy.to_empty(device=CPU)
-            if lora is not None:
-                add_lora(self.policy, lora)
 
     # --- what is exactly known ------------------------------------------------------------------------------------
 
@@ -112,15 +115,21 @@ class FakePolicy:
 
     def resident(self, load: Load) -> MemorySplit:
         """What is there at every optimiser step whatever the batch: weights, gradients and optimiser."""
-        block, trainable = _block(load.target), self.trainable()
-        state, _ = step_bytes(load.optimizer, trainable, block)
+        block = _block(load.target)
+        state, _ = self._optimiser(load)
         encoder = self._encoder()
         return MemorySplit(
             weights=self.weights(block),
-            gradients=storage_bytes(trainable, block),
+            gradients=sum(rounded(parameter.nbytes, block) for parameter in self.trainable()),
             optimiser=state,
             da3=0 if encoder is None else storage_bytes([*encoder.parameters(), *encoder.buffers()], block),
         )
+
+    def _optimiser(self, load: Load) -> tuple[int, int]:
+        """Bytes of the optimiser's state, and of what its step needs."""
+        self.policy.config.optimizer = load.optimizer  # which says what parameter groups there are
+        groups = self.policy.get_optim_params()
+        return step_bytes(load.optimizer, groups, _block(load.target), foreach=load.target == "cuda")
 
     def _encoder(self) -> Da3Encoder | None:
         source = None if self.policy.geometry is None else self.policy.geometry.source
@@ -130,14 +139,13 @@ class FakePolicy:
 
     def training(self, load: Load) -> MemorySplit:
         """The largest moment of a training step after the first, when the optimiser's state is there."""
-        block = _block(load.target)
-        state, workspace = step_bytes(load.optimizer, self.trainable(), block, foreach=load.target == "cuda")
-        step = self._step(replace(load, optimizer=""))
+        state, workspace = self._optimiser(load)
+        step = self._step(replace(load, optimizer="adamw"))
         running = replace(step.largest, optimiser=state)
         updating = replace(step.largest, gradients=step.gradients, optimiser=state, activations=workspace + step.batch)
         return max(running, updating, key=lambda split: split.total)
 
-    def _step(self, load: Load) -> "_Step":
+    def _step(self, load: Load) -> _Step:
         """Forward and backward pass, which do not depend on the optimiser; each load is run once."""
         if load in self._steps:
             return self._steps[load]
@@ -149,39 +157,35 @@ class FakePolicy:
                 for parameter in trainable
             ]
             batch = self._batch(load.batch_size, load.prompt_tokens)
-            if load.rows < load.batch_size:  # every micro-batch but the first finds all gradients there
-                for parameter in trainable:
-                    parameter.grad = torch.empty_like(parameter)
-                    counter.label([parameter.grad], "gradients")
-            _loss(policy, {key: value[: load.rows] for key, value in batch.items()}).backward()
-            gradients = storage_bytes([p.grad for p in trainable if p.grad is not None], block)
+            if load.rows == load.batch_size:
+                loss = policy.loss(batch, load.batch_size)
+            else:  # the second micro-batch, which finds all gradients there, stands for all that follow
+                parts = [slice(0, load.rows), slice(load.rows, 2 * load.rows)]
+                given = [rows_of(batch, load.batch_size, part) for part in parts]
+                loss = sum_of([partial(policy.loss, part, load.batch_size) for part in given], trainable)
+            loss.backward()
+            gradients = [p.grad for p in trainable if p.grad is not None]
+            step = _Step(counter.peak, storage_bytes(gradients, block), storage_bytes(batch.values(), block))
             for hook in hooks:
                 hook.remove()
             for parameter in trainable:
                 parameter.grad = None
-            self._steps[load] = _Step(counter.peak, gradients, storage_bytes(batch.values(), block))
-        return self._steps[load]
+        if load.rows < load.batch_size:  # the sums of gradients get their name when they are handed over, at the end
+            missing = step.gradients - step.largest.gradients
+            named = {"gradients": step.gradients, "activations": step.largest.activations - missing}
+            step = step._replace(largest=replace(step.largest, **named))
+        self._steps[load] = step
+        return step
 
     def inference(self, load: Load) -> MemorySplit:
-        """The largest moment of predicting one action chunk by the plain path. Two denoising steps stand for all.
-
-        The runner needs as much, and its masks and modulations beyond: some 20 MB at the released size.
-        """
+        """The largest moment of predicting one action chunk. Two denoising steps stand for all."""
         policy = self.policy.eval()
-        with ExitStack() as stack, torch.no_grad():
+        with ExitStack() as stack:
             counter = self._counter(stack, load.target)
-            network = policy.model.paligemma_with_expert
-            hook = network.register_forward_pre_hook(
-                lambda _, __, given: _label_cache(counter, given), with_kwargs=True
-            )
+            policy.sampler = CountedSampler(policy.model, counter, load.target)
             batch = self._batch(load.batch_size, load.prompt_tokens)
-            images, masks = prepare_images(batch, policy.config, CPU)
-            embs, pad = _geometry(policy, batch)
-            policy.model.sample_actions(
-                images, masks, batch["observation.language.tokens"], batch["observation.language.attention_mask"],
-                geom_embs=embs, geom_pad=pad, num_steps=2,
-            )  # fmt: skip
-            hook.remove()
+            del batch["action"]
+            policy.predict_action_chunk(batch, num_steps=2)
         return counter.peak
 
     def _counter(self, stack: ExitStack, target: Target) -> MemoryCounter:
@@ -211,35 +215,3 @@ class FakePolicy:
 
 def _block(target: Target) -> int:
     return CUDA_BLOCK if target == "cuda" else 1
-
-
-def _label_cache(counter: MemoryCounter, given: Mapping[str, Any]) -> None:
-    cache = given.get("past_key_values")
-    if cache is not None:
-        counter.label([cache.keys, cache.values], "cache")
-
-
-def _geometry(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
-    """Geometry tokens without looking into values, which fakes have not."""
-    if policy.geometry is None:
-        return None, None
-    with compute_in_float32(CPU):
-        return policy.geometry.adapter(policy.geometry.source(batch, check=False))
-
-
-def _loss(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Tensor:
-    """`PI05GeometryPolicy.forward` without what looks into values: logging, checks, and the draw of the noise."""
-    config = policy.config
-    images, masks = prepare_images(batch, config, CPU)
-    actions = pad_vector(batch["action"], config.max_action_dim).float()
-    samples = () if config.flow_samples == 1 else (config.flow_samples,)
-    noise = torch.zeros(actions.shape[0], *samples, *actions.shape[1:])
-    time = torch.zeros(actions.shape[0], *samples)
-    tokens, token_mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
-    losses = policy.model(images, masks, tokens, token_mask, actions, noise, time, *_geometry(policy, batch))
-    losses = losses[..., : config.action_feature.shape[0]]
-    if losses.ndim == 4:
-        losses = losses.mean(dim=1)
-    valid = torch.ones(losses.shape[:2], dtype=torch.bool)
-    losses = losses.masked_fill(~valid[..., None], 0.0)
-    return losses.sum() / (valid.sum() * losses.shape[-1])

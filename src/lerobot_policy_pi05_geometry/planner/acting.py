@@ -1,0 +1,63 @@
+"""Sampling of action chunks on fake tensors: the runner and the plain path as they are, but for what needs values."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from torch import Tensor
+
+from ..model.cache import SegmentKVCache
+from ..model.layout import Segment
+from ..model.pi05 import PI05Pytorch
+from ..model.runner import ChunkRunner, SegmentFrame
+from ..model.sampler import ChunkSampler
+from .counting import MemoryCounter
+
+Target = Literal["cuda", "cpu"]
+
+
+class CountedRunner(ChunkRunner):
+    """A runner whose matrices are weights and whose cache is a cache to the counter."""
+
+    def __init__(self, network: PI05Pytorch, counter: MemoryCounter, target: Target) -> None:
+        self._counter, self._target = counter, target
+        super().__init__(network)
+
+    def _build(self) -> None:
+        super()._build()
+        self._counter.label(self.tensors(), "weights")
+
+    def _schedule(self, num_steps: int) -> list[Any]:
+        return super()._schedule(self.config.num_inference_steps)[:num_steps]  # all are kept, however few are run here
+
+    def _frames(self, segments: Sequence[Any]) -> tuple[dict[Segment, SegmentFrame], SegmentKVCache]:
+        frames, cache = super()._frames(list(segments))
+        self._counter.label([cache.keys, cache.values], "cache")
+        return frames, cache
+
+    def _hides_nothing(self, seen: Tensor) -> bool:
+        return False  # there are no values to look at; prompts are padded in general
+
+    def _kernels(self, tensor: Tensor) -> str:
+        return self._target
+
+
+class CountedSampler(ChunkSampler):
+    """The sampler of a planned policy, which tells the counter what the cache is, whichever path computes the chunk."""
+
+    def __init__(self, network: PI05Pytorch, counter: MemoryCounter, target: Target) -> None:
+        super().__init__(network)
+        self._counter, self._target = counter, target
+
+    def __call__(self, *observation: Any, **kwargs: Any) -> Tensor:
+        hook = self._network.paligemma_with_expert.register_forward_pre_hook(self._label_cache, with_kwargs=True)
+        chunk = super().__call__(*observation, **kwargs)
+        hook.remove()
+        return chunk
+
+    def _make_runner(self) -> ChunkRunner:
+        return CountedRunner(self._network, self._counter, self._target)
+
+    def _label_cache(self, _: Any, __: Any, given: Mapping[str, Any]) -> None:
+        cache = given.get("past_key_values")
+        if cache is not None:
+            self._counter.label([cache.keys, cache.values], "cache")
