@@ -35,6 +35,7 @@ from lerobot_policy_pi05_geometry.planner.workload import FakePolicy, Load
 
 MIB = 2**20
 PROMPT = 60
+RANK = 16
 VLM = PaliGemmaVariant(
     gemma=GemmaVariant(width=256, depth=6, mlp_dim=1024, num_heads=8, num_kv_heads=1, head_dim=32),
     vision=VisionVariant(width=256, depth=6, mlp_dim=1024, num_heads=4, patch_size=14),
@@ -56,6 +57,8 @@ PURE_BF16 = {"dtype": "bfloat16", "param_dtype": "bfloat16"}
 CHECKPOINTED = {"gradient_checkpointing": True}
 EXPERT_ONLY = {"train_expert_only": True}
 FROZEN_VISION = {"freeze_vision_encoder": True}
+EIGHT_BIT = {"optimizer": "adamw8bit"}
+LORA = {"lora_targets": "expert+vlm", "rank": RANK}
 TRAIN, ACT = "training", "inference"
 # what, batch size, settings
 CPU_CASES: list[tuple[str, int, dict[str, Any]]] = [
@@ -71,12 +74,18 @@ CPU_CASES: list[tuple[str, int, dict[str, Any]]] = [
     (TRAIN, 8, {"flow_samples": 4}),
     (TRAIN, 8, {"geometry_source": "rgbd"}),
     (TRAIN, 8, {"geometry_source": "none"}),
+    (TRAIN, 16, {"micro_batch_size": 4}),
+    (TRAIN, 8, EIGHT_BIT),
+    (TRAIN, 8, LORA),
     (TRAIN, 8, BF16),
     (TRAIN, 8, BF16 | CHECKPOINTED),
+    (TRAIN, 8, PURE_BF16 | LORA | CHECKPOINTED),
     (ACT, 1, {}),
     (ACT, 8, {}),
+    (ACT, 1, BF16),
     (ACT, 1, PURE_BF16),
     (ACT, 8, {"geometry_source": "rgbd"}),
+    (ACT, 8, {"inference_runner": "plain"}),
 ]
 GPU_CASES: list[tuple[str, int, dict[str, Any]]] = [
     (TRAIN, 1, BF16 | CHECKPOINTED),
@@ -86,12 +95,16 @@ GPU_CASES: list[tuple[str, int, dict[str, Any]]] = [
     (TRAIN, 8, BF16 | EXPERT_ONLY | CHECKPOINTED),
     (TRAIN, 8, BF16 | EXPERT_ONLY),
     (TRAIN, 8, PURE_BF16 | CHECKPOINTED),
+    (TRAIN, 8, BF16 | EIGHT_BIT | CHECKPOINTED),
+    (TRAIN, 32, BF16 | CHECKPOINTED | {"micro_batch_size": 4}),
+    (TRAIN, 8, PURE_BF16 | LORA | CHECKPOINTED),
     (ACT, 1, BF16),
     (ACT, 1, PURE_BF16),
 ]
 
 
 def make_config(settings: dict[str, Any], gpu: bool) -> PI05GeometryConfig:
+    settings = {name: value for name, value in settings.items() if name != "rank"}
     common: dict[str, Any] = {"device": "cuda" if gpu else "cpu", "push_to_hub": False, "geometry_source": "random"}
     if gpu:
         return complete(PI05GeometryConfig(**common | settings), cameras=2, image_size=(480, 640))
@@ -99,9 +112,12 @@ def make_config(settings: dict[str, Any], gpu: bool) -> PI05GeometryConfig:
     return complete(config, cameras=2, image_size=(120, 160))
 
 
-def predict(what: str, batch: int, config: PI05GeometryConfig, gpu: bool) -> MemorySplit:
-    policy, load = FakePolicy(config), Load(batch, prompt_tokens=PROMPT, target="cuda" if gpu else "cpu")
-    return policy.training(load) if what == TRAIN else policy.inference(load)
+def predict(what: str, batch: int, settings: dict[str, Any], gpu: bool) -> MemorySplit:
+    config, target = make_config(settings, gpu), "cuda" if gpu else "cpu"
+    if what == ACT:
+        return FakePolicy(config).inference(Load(batch, None, PROMPT, target=target))
+    load = Load(batch, config.micro_batch_size, PROMPT, config.optimizer, target)
+    return FakePolicy(config, settings.get("rank")).training(load)
 
 
 def real_batch(policy: PI05GeometryPolicy, size: int, device: str) -> dict[str, Tensor]:
@@ -117,10 +133,14 @@ def real_batch(policy: PI05GeometryPolicy, size: int, device: str) -> dict[str, 
     return {key: value.to(device) for key, value in batch.items()}
 
 
-def measure(what: str, size: int, config: PI05GeometryConfig, gpu: bool) -> dict[str, float]:
+def measure(what: str, size: int, settings: dict[str, Any], gpu: bool) -> dict[str, float]:
     """Bytes at the peak of the second step or chunk."""
     resident = high_water_mark()
+    config = make_config(settings, gpu)
+    config.pretrained_path = Path("nowhere")  # LoRA wants one to start from; nothing is read
     policy = PI05GeometryPolicy(config)
+    if "rank" in settings:
+        policy.wrap_with_peft(peft_cli_overrides={"r": settings["rank"], "method_type": "LORA"})
     policy.train(what == TRAIN)
     batch = real_batch(policy, size, config.device)
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params()) if what == TRAIN else None
@@ -134,6 +154,7 @@ def measure(what: str, size: int, config: PI05GeometryConfig, gpu: bool) -> dict
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
+        policy.update()
 
     step()
     if gpu:
@@ -142,8 +163,7 @@ def measure(what: str, size: int, config: PI05GeometryConfig, gpu: bool) -> dict
         step()
         return {"bytes": torch.cuda.max_memory_allocated(), "reserved": torch.cuda.max_memory_reserved()}
     resident = (high_water_mark() - resident) * 2**30
-    states = [] if optimizer is None else [t for s in optimizer.state.values() for t in s.values()]
-    before = storage_bytes([*policy.parameters(), *policy.buffers(), *batch.values(), *states])
+    before = storage_bytes([*policy.parameters(), *policy.buffers(), *batch.values(), *kept(policy, optimizer)])
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
         step()
     events = [e for e in profiler.profiler.kineto_results.events() if e.name() == "[memory]"]
@@ -152,6 +172,18 @@ def measure(what: str, size: int, config: PI05GeometryConfig, gpu: bool) -> dict
         now += event.nbytes()
         highest = max(highest, now)
     return {"bytes": before + highest, "resident": resident}
+
+
+def kept(policy: PI05GeometryPolicy, optimizer: torch.optim.Optimizer | None) -> list[Tensor]:
+    """What stays between steps: the optimiser's state, the policy's copy of its new parameters; between chunks: the runner's."""
+    if optimizer is None:
+        runner = policy.sampler._runner
+        return [] if runner is None else runner.tensors()
+    state = [v for values in optimizer.state_dict()["state"].values() for v in values.values() if isinstance(v, Tensor)]
+    tables = [
+        moment.qmap for values in optimizer.state.values() for moment in values.values() if hasattr(moment, "qmap")
+    ]
+    return [*state, *tables, *policy._previous]
 
 
 def main() -> None:
@@ -163,14 +195,14 @@ def main() -> None:
     cases = GPU_CASES if args.gpu else CPU_CASES
     if args.case is not None:
         what, size, settings = cases[args.case]
-        print(json.dumps(measure(what, size, make_config(settings, args.gpu), args.gpu)))
+        print(json.dumps(measure(what, size, settings, args.gpu)))
         return
     device = torch.cuda.get_device_name() if args.gpu else platform.processor() or platform.machine()
     rows = []
     print(f"{'':10}{'batch':>6}{'predicted MiB':>15}{'measured MiB':>14}{'ratio':>7}{'resident MiB':>14}  settings")
     for index, (what, size, settings) in enumerate(cases):
         start = time.perf_counter()
-        split = predict(what, size, make_config(settings, args.gpu), args.gpu)
+        split = predict(what, size, settings, args.gpu)
         seconds = time.perf_counter() - start
         command = [sys.executable, "-m", "benchmarks.planner", "--case", str(index), *(["--gpu"] if args.gpu else [])]
         output = subprocess.run(command, check=True, capture_output=True, text=True).stdout

@@ -45,10 +45,27 @@ def test_training_and_inference_side_by_side():
 
 
 def test_proposals_with_the_command_that_trains_them():
-    shown = plan(*TINY, "--gpu", "8", "--batch_size", "4")
+    shown = plan(*TINY, "--gpu", "8", "--batch_size", "4", "--proposals", "1", "--explain", "--policy.max_depth=7")
     assert "full fine-tuning" in shown
-    assert "1. lerobot-train --policy.type=pi05_geometry --policy.dtype=bfloat16" in shown
-    assert "--batch_size=4" in shown
+    told = "1. lerobot-train --policy.type=pi05_geometry --policy.dtype=bfloat16 --policy.paligemma_variant=tiny"
+    assert told in shown
+    assert "--policy.max_depth=7.0 --batch_size=4 ..." in shown
+    assert "optimiser" in shown
+
+
+def test_lora_starts_from_a_checkpoint_and_needs_less():
+    pytest.importorskip("peft")
+    shown = plan(*TINY, "--gpu", "8", "--proposals", "1", "--peft.r=3", "--policy.lora_targets=expert+vlm")
+    assert "LoRA on VLM and expert" in shown
+    assert "1. lerobot-train --policy.path=CHECKPOINT " in shown
+    assert "--policy.lora_targets=expert+vlm" in shown
+    assert "--peft.r=3 --batch_size=8" in shown
+
+
+def test_features_from_a_store_need_no_encoder_in_training():
+    shown = plan(*TINY, "--policy.geometry_source=features")
+    training, inference = shown.split("Depth Anything 3 │ ")[1].split(" │ ")[:2]
+    assert (training, inference) == ("0.00", "0.16")
 
 
 @pytest.mark.parametrize(
@@ -56,9 +73,12 @@ def test_proposals_with_the_command_that_trains_them():
     [
         (["--gpu", "0.01"], "Nothing fits 0.0 GiB"),
         (["--gpu", "banana"], "'banana' is no GPU the planner knows"),
-        (["--gpu", "24", "--policy.train_expert_only=true", "--lora", "all"], "leave no recipe to try"),
-        (["--lora", "everything"], "--lora must be one of expert, all"),
-        (["--optimizer", "lion"], "knows the optimisers adamw and adamw8bit"),
+        (["--gpu", "24", "--policy.train_expert_only=true", "--peft.r=4"], "leave no recipe to try"),
+        (["--peft.r=none"], "--peft.r must be a whole number from 1 on, got 'none'"),
+        (["--peft.method_type=MISS"], "--peft.method_type=LORA only"),
+        (["--peft.init_type=x"], "'--peft.init_type=x' cannot be planned"),
+        (["--policy.lora_targets=all"], "--policy.lora_targets must be one of expert, expert+vlm"),
+        (["--policy.optimizer=lion"], "--policy.optimizer must be one of adamw, adamw8bit"),
         (["--policy.speed=3"], "--policy.speed is no setting of this policy"),
         (["--steps=3"], "'--steps=3' is no option of this command"),
         (["--policy.type=act"], "--policy.type=pi05_geometry only"),

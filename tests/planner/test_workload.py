@@ -1,8 +1,10 @@
 """Predicted bytes: equal to those that are there, and moving the way they must."""
 
+import gc
+import weakref
+
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+import torch
 from torch.profiler import ProfilerActivity, profile
 
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
@@ -79,11 +81,11 @@ def state_bytes(optimizer) -> list[int]:
     return [tensor.nbytes for tensor in (*kept, *tables)]
 
 
-@pytest.mark.parametrize("settings", [*SETTINGS, MICRO, MICRO | {"dtype": "bfloat16"}], ids=str)
-def test_training_equals_the_allocator(settings):
+@pytest.mark.parametrize("changes", [*SETTINGS, MICRO, MICRO | {"dtype": "bfloat16"}], ids=str)
+def test_training_equals_the_allocator(changes):
     """The whole step of the real policy, its optimiser's too, to 2 %: drawing and logging are not predicted."""
-    policy, batch = real(6, **settings)
-    predicted = fake(**settings).training(load(6, micro_batch_size=settings.get("micro_batch_size")))
+    policy, batch = real(6, **changes)
+    predicted = fake(**changes).training(load(6, micro_batch_size=changes.get("micro_batch_size")))
     assert predicted.total == pytest.approx(trained(policy, batch), rel=0.02)
 
 
@@ -99,38 +101,41 @@ def test_8_bits_equal_the_allocator():
 def test_lora_equals_the_allocator(tmp_path, targets, dtypes):
     """PEFT's policy as lerobot-train makes it: 4 samples, adapters of rank 5."""
     pytest.importorskip("peft")
-    settings = {"lora_targets": targets} | dtypes
-    policy, batch = real(4, **settings, pretrained_path=tmp_path)
+    changes = {"lora_targets": targets} | dtypes
+    policy, batch = real(4, **changes, pretrained_path=tmp_path)
     policy.wrap_with_peft(peft_cli_overrides={"r": 5, "method_type": "LORA"})
-    planned = fake(5, **settings)
+    planned = fake(5, **changes)
     assert {n: p.shape for n, p in planned.policy.named_parameters() if p.requires_grad} == {
         n: p.shape for n, p in policy.named_parameters() if p.requires_grad
     }
     assert planned.training(load(4)).total == pytest.approx(trained(policy, batch), rel=0.02)
 
 
-@pytest.mark.parametrize("runner", ["fast", "plain"])
-@pytest.mark.parametrize("settings", [s for s in SETTINGS if not TRAINING_ONLY & set(s)], ids=str)
-def test_inference_equals_the_allocator(settings, runner):
+@pytest.mark.parametrize(
+    ("changes", "runner"),
+    [(s, "fast") for s in SETTINGS if not TRAINING_ONLY & set(s)] + [(SETTINGS[0], "plain"), (SETTINGS[-1], "plain")],
+    ids=str,
+)
+def test_inference_equals_the_allocator(changes, runner):
     """To 2 % and the memory in which the CPU's convolution puts its weights into another order."""
-    policy, batch = real(16, inference_runner=runner, **settings)
+    policy, batch = real(16, inference_runner=runner, **changes)
     del batch["action"]
     policy.predict_action_chunk(batch)
     kept = [] if runner == "plain" or policy.sampler._runner is None else policy.sampler._runner.tensors()
     before = storage_bytes([*policy.parameters(), *policy.buffers(), *batch.values(), *kept])
     measured = before + allocated(lambda: policy.predict_action_chunk(batch))
-    predicted = fake(inference_runner=runner, **settings).inference(load(16)).total
+    predicted = fake(inference_runner=runner, **changes).inference(load(16)).total
     assert 0.98 * (measured - 4 * 32 * 3 * 14**2) <= predicted <= 1.02 * measured
 
 
-@pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_weights_gradients_and_optimiser_are_exact(settings):
-    policy, batch = real(2, **settings)
+@pytest.mark.parametrize("changes", [{}, *(s for s in SETTINGS if TRAINING_ONLY & set(s))][:4] + SETTINGS[-1:], ids=str)
+def test_weights_gradients_and_optimiser_are_exact(changes):
+    policy, batch = real(2, **changes)
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     policy.train().forward(batch)[0].backward()
     gradients = [p.grad for p in policy.parameters() if p.grad is not None]
     optimizer.step()
-    planned = fake(**settings)
+    planned = fake(**changes)
     split = planned.training(load(2))
     assert split.weights == planned.weights() == storage_bytes([*policy.parameters(), *policy.buffers()])
     assert split.optimiser == sum(state_bytes(optimizer))
@@ -138,23 +143,35 @@ def test_weights_gradients_and_optimiser_are_exact(settings):
     assert (resident.gradients, resident.optimiser) == (storage_bytes(gradients), sum(state_bytes(optimizer)))
 
 
-@given(st.integers(1, 6), st.integers(1, 6), st.sampled_from(SETTINGS), st.sampled_from(["cpu", "cuda"]))
-def test_more_samples_need_more(size, more, settings, target):
-    planned = fake(**settings)
-    less, most = (planned.training(load(n, target=target)) for n in (size, size + more))
+@pytest.mark.parametrize("target", ["cpu", "cuda"])
+@pytest.mark.parametrize(
+    "changes", [{"flow_samples": 2}, {"dtype": "bfloat16", "gradient_checkpointing": True}], ids=str
+)
+def test_more_samples_need_more(changes, target):
+    planned = fake(**changes)
+    loads = [load(n, target=target) for n in (3, 5)]
+    less, most = (planned.training(asked) for asked in loads)
     assert less.total < most.total
     assert less.optimiser == most.optimiser
-    assert (
-        planned.inference(load(size, target=target)).total < planned.inference(load(size + more, target=target)).total
-    )
+    assert planned.inference(loads[0]).total < planned.inference(loads[1]).total
 
 
-@given(st.integers(4, 16), st.booleans())
-def test_checkpointing_lowers_activations(size, bf16):
-    dtype = {"dtype": "bfloat16" if bf16 else "float32"}
-    kept, recomputed = (fake(gradient_checkpointing=on, **dtype).training(load(size)) for on in (False, True))
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_checkpointing_lowers_activations(dtype):
+    kept, recomputed = (fake(gradient_checkpointing=on, dtype=dtype).training(load(9)) for on in (False, True))
     assert recomputed.activations < 0.8 * kept.activations
     assert recomputed.optimiser == kept.optimiser
+
+
+def test_a_planned_policy_is_freed_whole():
+    """It is in no cycle with what it has counted, nor held by anything global: planning on and on takes no more memory."""
+    planned = fake()
+    planned.training(load(2, micro_batch_size=1))
+    planned.inference(load(1))
+    alive = [weakref.ref(planned.policy), *(weakref.ref(p) for p in planned.policy.parameters())]
+    del planned
+    gc.collect()
+    assert not any(reference() is not None for reference in alive)
 
 
 def test_what_is_frozen_has_no_gradient_and_no_state():
@@ -205,8 +222,8 @@ def test_depth_anything_has_a_purpose_of_its_own():
 
 def test_on_cuda_pure_bf16_layer_norms_are_float32():
     """As CUDA's autocast has it, and the CPU's has not: what the vision tower remembers grows."""
-    settings = {"dtype": "bfloat16", "param_dtype": "bfloat16"}
-    planned = fake(**settings)
+    changes = {"dtype": "bfloat16", "param_dtype": "bfloat16"}
+    planned = fake(**changes)
     norms = 2 * 2 + 1  # layers of `tiny`'s vision tower
     seen = 8 * 2 * 4 * 32  # samples, cameras, patches, width
     cuda, cpu = (planned.training(load(8, target=target)).activations for target in ("cuda", "cpu"))
@@ -218,10 +235,11 @@ def test_on_cuda_pure_bf16_layer_norms_are_float32():
 
 
 @pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("case", range(3))
 def test_on_a_gpu_within_ten_percent(case):
-    from benchmarks.planner import GPU_CASES, make_config, measure, predict
+    from benchmarks.planner import GPU_CASES, measure, predict
 
-    what, size, settings = [c for c in GPU_CASES if c[2].get("train_expert_only") or c[0] == "inference"][case]
-    measured = measure(what, size, make_config(settings, gpu=True), gpu=True)["bytes"]
-    assert predict(what, size, make_config(settings, gpu=True), gpu=True).total == pytest.approx(measured, rel=0.1)
+    what, size, changes = [c for c in GPU_CASES if c[2].get("train_expert_only") or c[0] == "inference"][case]
+    measured = measure(what, size, changes, gpu=True)["bytes"]
+    assert predict(what, size, changes, gpu=True).total == pytest.approx(measured, rel=0.1)

@@ -14,14 +14,6 @@ def plan(
         str | None, typer.Option(help="Propose what fits it: its memory in GB (24), or a card (h100).")
     ] = None,
     batch_size: Annotated[int, typer.Option("--batch_size", help="Samples per training step.", min=1)] = 8,
-    micro_batch_size: Annotated[
-        int, typer.Option(help="Samples whose activations are held at once; 0 for the whole batch.", min=0)
-    ] = 0,
-    optimizer: Annotated[
-        str | None, typer.Option(help="adamw or adamw8bit. Default: adamw, or whichever fits.")
-    ] = None,
-    lora: Annotated[str | None, typer.Option(help="LoRA adapters on the expert, or on all (VLM and expert).")] = None,
-    lora_rank: Annotated[int, typer.Option(help="Rank of the adapters.", min=1)] = 16,
     cameras: Annotated[int, typer.Option(help="RGB cameras, where no checkpoint names them.", min=0)] = 2,
     depth_cameras: Annotated[int, typer.Option(help="Of them with depth, for geometry_source=rgbd.", min=1)] = 1,
     image_size: Annotated[str, typer.Option(help="Height x width in which images arrive.")] = "480x640",
@@ -35,8 +27,9 @@ def plan(
 ) -> None:
     """Will it fit? Predict peak memory of training and inference, without a GPU and without allocating it.
 
-    Settings are given as to lerobot-train: `pi05-geometry plan --policy.dtype=bfloat16 --batch_size=8`, or
-    `--policy.path=CHECKPOINT` for its own.
+    Settings are given as to lerobot-train: `pi05-geometry plan --policy.dtype=bfloat16 --batch_size=8`,
+    `--policy.path=CHECKPOINT` for its own, `--policy.micro_batch_size=2`, `--policy.optimizer=adamw8bit`, `--peft.r=16
+    --policy.lora_targets=expert+vlm` for LoRA.
 
     With --gpu, propose settings that fit, best first: the closest to full fine-tuning (full; all but the vision tower, each with
     AdamW before 8-bit AdamW; LoRA on VLM and expert; the action expert only; LoRA on the expert), and of each the largest
@@ -48,6 +41,6 @@ def plan(
     if len(sizes) != 2 or not all(side.isdecimal() and int(side) > 0 for side in sizes):
         raise ValueError(f"--image-size is height x width in pixels, as 480x640; got '{image_size}'.")
     data = Data(cameras, depth_cameras, (int(sizes[0]), int(sizes[1])), prompt_tokens)
-    wish = Wish(gpu, batch_size, micro_batch_size or None, optimizer, lora, lora_rank, proposals, explain)
+    wish = Wish(gpu, batch_size, proposals, explain)
     for shown in run(context.args, data, wish):
-        console.print(shown)
+        console.print(shown, soft_wrap=isinstance(shown, str))  # a command to copy is one line

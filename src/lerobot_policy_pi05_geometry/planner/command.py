@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from rich.console import RenderableType
+from rich.markup import escape
 
 from ..configuration_pi05_geometry import DEFAULT_ENCODER, PI05GeometryConfig
-from .configuration import complete
+from .adapters import SOMEWHERE
+from .configuration import acting, complete
 from .gpus import GIB, gpu_bytes
-from .lora import LORA_TARGETS, LoraPlan
-from .options import configuration, da3_variant, policy_options, typed
+from .options import configuration, da3_variant, lora_rank, policy_options, typed
 from .proposals import Fixed, Proposal, Rejection, propose
 from .tables import explanation, proposal_table, split_table
 from .workload import FakePolicy, Load
@@ -28,24 +29,21 @@ class Data:
 
 @dataclass(frozen=True)
 class Wish:
-    """What the user asks beside the policy's settings; see the command's help. None is open."""
+    """What the user asks beside the policy's settings; see the command's help."""
 
     gpu: str | None = None
     batch_size: int = 8
-    micro_batch_size: int | None = None
-    optimizer: str | None = None
-    lora: str | None = None
-    lora_rank: int = 16
     proposals: int = 3
     explain: bool = False
 
 
 def run(arguments: Sequence[str], data: Data, wish: Wish) -> Iterator[RenderableType]:
-    """What to print, piece by piece.
+    """What to print, piece by piece. arguments: `--policy.*` and `--peft.*`, as lerobot-train takes them.
 
     Raises ValueError, with one sentence, for what cannot be read, and where nothing fits.
     """
-    options = policy_options(arguments)
+    rank, others = lora_rank(arguments)
+    options = policy_options(others)
 
     def make_config(changes: Mapping[str, Any]) -> PI05GeometryConfig:
         text = {name: str(value).lower() for name, value in changes.items()}
@@ -53,46 +51,48 @@ def run(arguments: Sequence[str], data: Data, wish: Wish) -> Iterator[Renderable
 
     config = make_config({})
     budget = None if wish.gpu is None else gpu_bytes(wish.gpu)
-    lora = None
-    if wish.lora is not None:
-        if wish.lora not in LORA_TARGETS:
-            raise ValueError(f"--lora must be one of {', '.join(LORA_TARGETS)}, got '{wish.lora}'.")
-        lora = LoraPlan(wish.lora_rank, wish.lora)
-    da3 = da3_variant(config.da3_encoder or DEFAULT_ENCODER) if config.geometry_source == "da3" else None
-    load = Load(
-        wish.batch_size,
-        wish.micro_batch_size,
-        data.prompt_tokens or config.tokenizer_max_length,
-        wish.optimizer or "adamw",
-        lora,
-    )
+    looks = config.geometry_source in ("da3", "features")
+    da3 = da3_variant(config.da3_encoder or DEFAULT_ENCODER) if looks else None
+    prompt = data.prompt_tokens or config.tokenizer_max_length
+    load = Load(wish.batch_size, config.micro_batch_size, prompt, config.optimizer)
     if budget is None:
-        policy = FakePolicy(config, lora, da3)
-        prediction = FakePolicy(config, None, da3) if lora else policy  # adapters are merged before a policy acts
-        splits = {
-            "training": policy.training(load),
-            "inference": prediction.inference(Load(1, None, load.prompt_tokens)),
-        }
-        yield split_table(splits)
+        training = FakePolicy(config, rank, da3).training(load)
+        # Adapters are merged before a policy acts.
+        inference = FakePolicy(acting(make_config({})), None, da3).inference(Load(1, None, prompt))
+        yield split_table({"training": training, "inference": inference})
     else:
-        fixed = Fixed(typed(options, config), wish.optimizer, lora)
-        found: list[Proposal] = []
-        rejected: list[Rejection] = []
-        for outcome in propose(make_config, load, budget, fixed, da3):
-            (found if isinstance(outcome, Proposal) else rejected).append(outcome)  # type: ignore[arg-type]
-            if len(found) == wish.proposals:
-                break
-        if not found:
-            least = rejected[-1] if rejected else None
-            why = f"{least.recipe.name}: {least.why}" if least else "the given settings leave no recipe to try"
-            raise ValueError(f"Nothing fits {budget / GIB:.1f} GiB ({why}); give a larger GPU, or fix fewer settings.")
-        yield proposal_table(found, budget)
-        for number, proposal in enumerate(found, 1):
-            adapters = proposal.recipe.lora
-            note = "" if adapters is None else f" (with adapters of rank {adapters.rank})"
-            yield f"{number}. lerobot-train --policy.type=pi05_geometry {' '.join(proposal.options())} ...{note}"
-        if wish.explain:
-            for rejection in rejected:
-                yield f"{rejection.recipe.name} does not fit: {rejection.why}."
+        yield from _proposals(make_config, load, budget, Fixed(typed(options, config), rank), da3, wish, options)
     if wish.explain:
         yield explanation(config, load)
+
+
+def _proposals(
+    make_config: Any, load: Load, budget: int, fixed: Fixed, da3: Any, wish: Wish, options: Mapping[str, str]
+) -> Iterator[RenderableType]:
+    """The table, the commands, and with `explain` what did not fit."""
+    found: list[Proposal] = []
+    rejected: list[Rejection] = []
+    for outcome in propose(make_config, load, budget, fixed, da3):
+        if isinstance(outcome, Rejection):
+            rejected.append(outcome)
+        else:
+            found.append(outcome)
+        if len(found) == wish.proposals:
+            break
+    if not found:
+        why = (
+            f"{rejected[-1].recipe.name}: {rejected[-1].why}"
+            if rejected
+            else "the settings given leave no recipe to try"
+        )
+        raise ValueError(f"Nothing fits {budget / GIB:.1f} GiB ({why}); give a larger GPU, or fix fewer settings.")
+    yield proposal_table(found, budget)
+    for number, proposal in enumerate(found, 1):
+        start = "--policy.type=pi05_geometry"
+        if "path" in options or proposal.recipe.lora:  # LoRA corrects weights that are there
+            start = f"--policy.path={options.get('path', SOMEWHERE)}"
+        yield escape(f"{number}. lerobot-train {start} {' '.join(proposal.options())} ...")
+    if wish.explain:
+        yield split_table({str(number): proposal.split for number, proposal in enumerate(found, 1)})
+    for rejection in rejected if wish.explain else [r for r in rejected if r.unavailable]:
+        yield escape(f"Not proposed: {rejection.recipe.name}, since {rejection.why}.")

@@ -1,5 +1,7 @@
 """A configuration as complete as a policy needs it, where no dataset is there to complete it."""
 
+from dataclasses import replace
+
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
@@ -42,3 +44,8 @@ def complete(
             intrinsics = [float(width), float(width), width / 2, height / 2]
             config.calibration.setdefault(name, CameraCalibration(intrinsics, [width, height], _POSE))
     return config
+
+
+def acting(config: PI05GeometryConfig) -> PI05GeometryConfig:
+    """The configuration of a policy at inference: one that was trained on stored features looks live."""
+    return replace(config, geometry_source="da3") if config.geometry_source == "features" else config

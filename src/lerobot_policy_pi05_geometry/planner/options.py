@@ -1,4 +1,4 @@
-"""The user's `--policy.*` options as a configuration, and Depth Anything 3's size from its name."""
+"""The user's `--policy.*` and `--peft.*` options as a configuration and a rank, and Depth Anything 3's size from its name."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -13,7 +13,27 @@ from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..frozen import read_variant
 from ..geometry.da3 import VARIANTS, Da3Variant
 
-_PREFIX = "--policy."
+_PREFIX, _PEFT = "--policy.", "--peft."
+_PEFT_RANK, _PEFT_METHOD, _PEFT_SCALE = "r", "method_type", "lora_alpha"
+
+
+def lora_rank(arguments: Sequence[str]) -> tuple[int | None, list[str]]:
+    """The rank that `--peft.*` options ask for, None without one, and the other arguments. Raises ValueError."""
+    given = {}
+    for argument in arguments:
+        name, separator, value = argument.removeprefix(_PEFT).partition("=")
+        if argument.startswith(_PEFT):
+            if not separator or name not in (_PEFT_RANK, _PEFT_METHOD, _PEFT_SCALE):
+                raise ValueError(f"'{argument}' cannot be planned; of PEFT the planner knows --peft.r=RANK.")
+            given[name] = value
+    if not given:
+        return None, list(arguments)
+    if given.get(_PEFT_METHOD, "LORA").upper() != "LORA":
+        raise ValueError(f"The planner knows --peft.method_type=LORA only, got '{given[_PEFT_METHOD]}'.")
+    rank = given.get(_PEFT_RANK, "16")
+    if not rank.isdecimal() or int(rank) < 1:
+        raise ValueError(f"--peft.r must be a whole number from 1 on, got '{rank}'.")
+    return int(rank), [argument for argument in arguments if not argument.startswith(_PEFT)]
 
 
 def policy_options(arguments: Sequence[str]) -> dict[str, str]:
@@ -24,7 +44,7 @@ def policy_options(arguments: Sequence[str]) -> dict[str, str]:
         name, separator, value = argument.removeprefix(_PREFIX).partition("=")
         if not argument.startswith(_PREFIX) or not separator:
             raise ValueError(
-                f"'{argument}' is no option of this command; the policy's settings are {_PREFIX}name=value."
+                f"'{argument}' is no option of this command; the policy's settings are {_PREFIX}name=value; see --help."
             )
         if name not in known:
             raise ValueError(

@@ -4,10 +4,12 @@ from collections.abc import Sequence
 from dataclasses import fields
 
 from rich.table import Table
+from rich.text import Text
 
 from ..configuration_pi05_geometry import PI05GeometryConfig
 from .counting import MemorySplit
 from .gpus import CONTEXT, FRAGMENTATION, GIB, needed
+from .optimisers import COMPILED_COPIES
 from .proposals import Proposal
 from .workload import Load
 
@@ -31,9 +33,8 @@ def split_table(splits: dict[str, MemorySplit]) -> Table:
 
 def proposal_table(proposals: Sequence[Proposal], budget: int) -> Table:
     """One row per proposal, best first."""
-    purposes = [p for p in PURPOSES if any(getattr(proposal.split, p) for proposal in proposals)]
     table = Table("", "what is trained", title=f"What fits {budget / GIB:.1f} GiB, best first")
-    for name in ("samples at once", "checkpointing", "GPU needed, GiB", *(PURPOSES[p] for p in purposes)):
+    for name in ("samples at once", "checkpointing", "GPU needed, GiB"):
         table.add_column(name, justify="right")
     for number, proposal in enumerate(proposals, 1):
         table.add_row(
@@ -42,12 +43,11 @@ def proposal_table(proposals: Sequence[Proposal], budget: int) -> Table:
             f"{proposal.load.rows} of {proposal.load.batch_size}",
             "on" if proposal.checkpointing else "off",
             f"[bold]{needed(proposal.split) / GIB:.1f}[/bold]",
-            *(f"{getattr(proposal.split, purpose) / GIB:.1f}" for purpose in purposes),
         )
     return table
 
 
-def explanation(config: PI05GeometryConfig, load: Load) -> str:
+def explanation(config: PI05GeometryConfig, load: Load) -> Text:
     """What counts as what, and what was assumed."""
     cameras = ", ".join(f"{f.shape[-2]} x {f.shape[-1]}" for f in config.image_features.values()) or "no camera"
     lines = (
@@ -57,12 +57,14 @@ def explanation(config: PI05GeometryConfig, load: Load) -> str:
         "forward and backward pass, and optimiser's step.",
         "[bold]activations[/bold] are all that has no other name: inputs, intermediates, weights cast to bfloat16, what AdamW "
         "needs during its step. [bold]optimiser[/bold]: two moments per trained parameter, of one byte each with 8-bit AdamW. "
-        "[bold]cache[/bold]: an observation's keys and values.",
+        "[bold]cache[/bold]: an observation's keys and values. [bold]weights[/bold] at inference: what the runner keeps in the "
+        "compute dtype, too.",
         "[bold]What was assumed[/bold]",
         f"Images: {cameras}, float32 on the GPU as LeRobot's loader gives them. Prompts of {load.prompt_tokens} tokens.",
-        "One GPU; DDP adds the gradients once more, for its buckets. AdamW's foreach variant, PyTorch's default on CUDA. "
+        "One GPU; DDP adds the gradients once more, for its buckets. AdamW's foreach variant, PyTorch's default on CUDA; "
+        f"8-bit AdamW as torchao's compiled step, with {COMPILED_COPIES:g} float32 copies of the largest parameter (measured on a CPU). "
         "Attention by a fused kernel, which keeps no matrix of weights, but for the suffix while its gate is trained.",
         f"GPU needed is the peak, {FRAGMENTATION:.0%} of it for fragmentation, and {CONTEXT / GIB:.2f} GiB for CUDA's context "
         "and workspaces. These two margins are assumptions; no GPU was at hand to measure them.",
     )
-    return "\n".join(lines)
+    return Text.from_markup("\n".join(lines))

@@ -6,7 +6,6 @@ autocast off for a CUDA it does not find. Attention then counts as PyTorch's fus
 keeps its output and one number per query. What CUDA's autocast does otherwise is in `CudaAutocast`.
 """
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -80,9 +79,7 @@ class FakePolicy:
     features the policy can be trained; for inference, where it looks live, plan one with geometry_source=da3.
     """
 
-    def __init__(
-        self, config: PI05GeometryConfig, lora_rank: int | None = None, da3: Da3Variant | None = None
-    ) -> None:
+    def __init__(self, config: PI05GeometryConfig, lora_rank: int | None = None, da3: Da3Variant | None = None) -> None:
         config.device = "cpu"
         self._steps: dict[Load, _Step] = {}
         self.mode = FakeTensorMode(allow_non_fake_inputs=True)
@@ -141,8 +138,13 @@ class FakePolicy:
         """The largest moment of a training step after the first, when the optimiser's state is there."""
         state, workspace = self._optimiser(load)
         step = self._step(replace(load, optimizer="adamw"))
-        running = replace(step.largest, optimiser=state)
-        updating = replace(step.largest, gradients=step.gradients, optimiser=state, activations=workspace + step.batch)
+        new = [p for p in self.policy.new_parameters().values() if p.requires_grad]
+        before = sum(
+            rounded(p.nbytes, _block(load.target)) for p in new
+        )  # `update` keeps them, to measure how far they move
+        running = replace(step.largest, optimiser=state, activations=step.largest.activations + before)
+        at_update = before + workspace + step.batch
+        updating = replace(step.largest, gradients=step.gradients, optimiser=state, activations=at_update)
         return max(running, updating, key=lambda split: split.total)
 
     def _step(self, load: Load) -> _Step:
