@@ -101,7 +101,6 @@ def test_a_checkpoints_own_settings(tmp_path):
     assert json.loads((tmp_path / "config.json").read_text())["type"] == PI05GeometryConfig.get_choice_name(
         PI05GeometryConfig
     )
-    assert "weights" in plan(f"--policy.path={tmp_path}")
     assert "30 x 40, 28 x 28" in plan(f"--policy.path={tmp_path}", "--explain", "--policy.chunk_size=9")
 
 

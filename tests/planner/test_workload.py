@@ -143,22 +143,20 @@ def test_weights_gradients_and_optimiser_are_exact(changes):
     assert (resident.gradients, resident.optimiser) == (storage_bytes(gradients), sum(state_bytes(optimizer)))
 
 
-@pytest.mark.parametrize("target", ["cpu", "cuda"])
 @pytest.mark.parametrize(
     "changes", [{"flow_samples": 2}, {"dtype": "bfloat16", "gradient_checkpointing": True}], ids=str
 )
-def test_more_samples_need_more(changes, target):
+def test_more_samples_need_more(changes):
     planned = fake(**changes)
-    loads = [load(n, target=target) for n in (3, 5)]
+    loads = [load(n, target="cuda") for n in (3, 5)]
     less, most = (planned.training(asked) for asked in loads)
     assert less.total < most.total
     assert less.optimiser == most.optimiser
     assert planned.inference(loads[0]).total < planned.inference(loads[1]).total
 
 
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_checkpointing_lowers_activations(dtype):
-    kept, recomputed = (fake(gradient_checkpointing=on, dtype=dtype).training(load(9)) for on in (False, True))
+def test_checkpointing_lowers_activations():
+    kept, recomputed = (fake(gradient_checkpointing=on, dtype="bfloat16").training(load(9)) for on in (False, True))
     assert recomputed.activations < 0.8 * kept.activations
     assert recomputed.optimiser == kept.optimiser
 
@@ -194,13 +192,14 @@ def test_inference_has_neither_gradients_nor_optimiser(runner):
 
 
 def test_micro_batches_need_what_one_needs_and_the_gradients():
-    planned = fake(geometry_source="random")
-    whole, small = (planned.training(load(size)) for size in (16, 2))
-    micro = planned.training(load(16, micro_batch_size=2))
+    planned = fake(geometry_source="none")
+    whole, small = (planned.training(load(size)) for size in (12, 2))
+    micro = planned.training(load(12, micro_batch_size=2))
     assert small.total < micro.total < whole.total
-    gradients, batch = planned.resident(load(2)).gradients, without(make_batch(16), "task", "index")
+    gradients, batch = planned.resident(load(2)).gradients, without(make_batch(12), "task", "index")
+    assert micro.gradients == gradients
     assert micro.total <= small.total + gradients + storage_bytes(batch.values())
-    assert planned.training(load(16, micro_batch_size=16)) == planned.training(load(16, micro_batch_size=99)) == whole
+    assert planned.training(load(12, micro_batch_size=99)) == planned.training(load(12, micro_batch_size=0)) == whole
 
 
 def test_8_bits_lower_the_state():
@@ -228,10 +227,6 @@ def test_on_cuda_pure_bf16_layer_norms_are_float32():
     seen = 8 * 2 * 4 * 32  # samples, cameras, patches, width
     cuda, cpu = (planned.training(load(8, target=target)).activations for target in ("cuda", "cpu"))
     assert cuda - cpu > 0.5 * norms * 2 * seen
-    plain = fake(
-        dtype="bfloat16"
-    )  # there, the residual stream is float32 already, and blocks of 512 bytes are what is left
-    assert plain.training(load(8, target="cuda")).total < 1.2 * plain.training(load(8, target="cpu")).total
 
 
 @pytest.mark.gpu

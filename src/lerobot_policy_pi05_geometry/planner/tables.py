@@ -61,8 +61,9 @@ def explanation(config: PI05GeometryConfig, load: Load) -> Text:
         "compute dtype, too.",
         "[bold]What was assumed[/bold]",
         f"Images: {cameras}, float32 on the GPU as LeRobot's loader gives them. Prompts of {load.prompt_tokens} tokens.",
-        "One GPU; DDP adds the gradients once more, for its buckets. AdamW's foreach variant, PyTorch's default on CUDA; "
-        f"8-bit AdamW as torchao's compiled step, with {COMPILED_COPIES:g} float32 copies of the largest parameter (measured on a CPU). "
+        "One GPU; DDP adds the gradients once more, for its buckets. AdamW's foreach variant, PyTorch's default on CUDA. "
+        f"8-bit AdamW: torchao's compiled step, with {COMPILED_COPIES:g} float32 copies of the largest parameter, measured "
+        "on a CPU. "
         "Attention by a fused kernel, which keeps no matrix of weights, but for the suffix while its gate is trained.",
         f"GPU needed is the peak, {FRAGMENTATION:.0%} of it for fragmentation, and {CONTEXT / GIB:.2f} GiB for CUDA's context "
         "and workspaces. These two margins are assumptions; no GPU was at hand to measure them.",
