@@ -68,3 +68,13 @@ def test_labels_move_bytes_and_make_none():
         c = torch.empty(1)
     assert counter.peak == MemorySplit(cache=40, gradients=80, activations=4)
     assert storage_bytes([a, a[1:], b, c], 64) == 64 + 128 + 64
+
+
+def test_what_comes_in_a_named_stretch_has_that_name():
+    with FakeTensorMode(), MemoryCounter() as counter:
+        a = torch.empty(10)
+        with counter.naming("cache"):
+            b = torch.empty(20)
+        c = torch.empty(1)
+    assert counter.peak == MemorySplit(cache=80, activations=44)
+    assert storage_bytes([a, b, c]) == 124

@@ -191,6 +191,17 @@ def test_inference_has_neither_gradients_nor_optimiser(runner):
     assert split.cache == 2 * expert.depth * 2 * expert.num_kv_heads * tokens * expert.head_dim * 4
 
 
+def test_matrices_that_the_runner_keeps_are_weights():
+    """bf16 copies of the layers' matrices over float32 storage; none where storage is bf16 already."""
+    plain, fast = (fake(dtype="bfloat16", inference_runner=runner).inference(load(1)) for runner in ("plain", "fast"))
+    network = fake().policy.model.paligemma_with_expert
+    matrices = sum(p.numel() for n, p in network.named_parameters() if ".layers." in n and "_proj.weight" in n)
+    vision = sum(p.numel() for n, p in network.named_parameters() if "vision" in n and "_proj.weight" in n)
+    assert fast.weights - plain.weights == pytest.approx(2 * (matrices - vision), rel=0.1)  # and modulations
+    pure = {"dtype": "bfloat16", "param_dtype": "bfloat16"}
+    assert fake(**pure).inference(load(16)).weights < 1.1 * fake(**pure).weights()
+
+
 def test_micro_batches_need_what_one_needs_and_the_gradients():
     planned = fake(geometry_source="none")
     whole, small = (planned.training(load(size)) for size in (12, 2))

@@ -23,8 +23,8 @@ class CountedRunner(ChunkRunner):
         super().__init__(network)
 
     def _build(self) -> None:
-        super()._build()
-        self._counter.label(self.tensors(), "weights")
+        with self._counter.naming("weights"):
+            super()._build()
 
     def _schedule(self, num_steps: int) -> list[Any]:
         return super()._schedule(self.config.num_inference_steps)[:num_steps]  # all are kept, however few are run here

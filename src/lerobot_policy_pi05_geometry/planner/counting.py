@@ -7,7 +7,8 @@ CUDA does only for tensors on CUDA devices, and its categories do not know a cac
 
 import weakref
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -37,7 +38,7 @@ class MemorySplit:
 
 
 class MemoryCounter(TorchDispatchMode):
-    """While active, every new storage is an activation until `label` gives it another purpose.
+    """While active, every new storage is an activation until `label` gives it another purpose, or `naming` has one for it.
 
     block: bytes that a storage is rounded up to; 1 for none.
     """
@@ -46,10 +47,20 @@ class MemoryCounter(TorchDispatchMode):
         super().__init__()
         self.block = block
         self.peak = MemorySplit()
+        self._purpose: Purpose = "activations"
         self._now: Counter[Purpose] = Counter()
         self._total = 0
         self._highest = 0
         self._live: dict[int, tuple[weakref.ref, Purpose, int]] = {}
+
+    @contextmanager
+    def naming(self, purpose: Purpose) -> Iterator[None]:
+        """New storages have this purpose meanwhile."""
+        before, self._purpose = self._purpose, purpose
+        try:
+            yield
+        finally:
+            self._purpose = before
 
     def label(self, tensors: Iterable[Tensor], purpose: Purpose) -> None:
         """Say what these tensors' storages are for, whether or not they have been seen before."""
@@ -75,8 +86,8 @@ class MemoryCounter(TorchDispatchMode):
         if key not in self._live:
             size = -(-storage.nbytes() // self.block) * self.block
             # PyTorch keeps a storage's Python object as long as the storage itself, so this tells when it is freed.
-            self._live[key] = (weakref.ref(storage, lambda _: self._forget(key)), "activations", size)
-            self._now["activations"] += size
+            self._live[key] = (weakref.ref(storage, lambda _: self._forget(key)), self._purpose, size)
+            self._now[self._purpose] += size
             self._total += size
         return key
 
