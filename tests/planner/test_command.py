@@ -111,16 +111,18 @@ def test_encoders_by_their_released_names(name):
 
 
 @pytest.mark.slow
-def test_the_released_size_in_seconds_and_without_memory():
-    """Peak resident set below 2 GiB, of which PyTorch and LeRobot have some 0.8, for a model of 12.5."""
+def test_the_released_size_without_its_memory():
+    """Peak resident set below 2 GiB, of which PyTorch and LeRobot have some 0.8, for a model of 12.5.
+
+    By hand: 3.355 B parameters; AdamW keeps two moments of all but the 0.11 B that feed nothing.
+    """
     program = (
-        "import sys; sys.argv = ['pi05-geometry', 'plan', '--policy.dtype=bfloat16'];"
+        "import sys; sys.argv = ['pi05-geometry', 'plan', '--policy.gradient_checkpointing=true', '--batch_size=1'];"
         "from lerobot_policy_pi05_geometry.cli import app; app(standalone_mode=False);"
-        "import time; print('HWM', next(l.split()[1] for l in open('/proc/self/status') if l.startswith('VmHWM')),"
-        "time.process_time())"
+        "print('HWM', next(l.split()[1] for l in open('/proc/self/status') if l.startswith('VmHWM')))"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=600)
-    resident, seconds = result.stdout.split("HWM ")[1].split()
-    assert float(seconds) < 60
-    assert "12.50" in result.stdout
+    shown, resident = result.stdout.split("HWM ")
+    table = {row.split("│")[1].strip(): row.split("│")[2].strip() for row in shown.splitlines() if row.count("│") == 4}
+    assert (table["weights"], table["gradients"], table["optimiser"]) == ("12.50", "12.09", "24.18")
     assert int(resident) < 2 * 2**20
