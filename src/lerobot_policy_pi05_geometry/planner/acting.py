@@ -25,6 +25,7 @@ class CountedRunner(ChunkRunner):
     def _build(self) -> None:
         with self._counter.naming("weights"):
             super()._build()
+            self._schedule(self.config.num_inference_steps)  # of the chunk before
 
     def _schedule(self, num_steps: int) -> list[Any]:
         return super()._schedule(self.config.num_inference_steps)[:num_steps]  # all are kept, however few are run here
