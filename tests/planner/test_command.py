@@ -12,6 +12,7 @@ from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
 from lerobot_policy_pi05_geometry.planner.options import da3_variant
 
 TINY = ["--policy.paligemma_variant=tiny", "--policy.action_expert_variant=tiny", "--policy.image_resolution=[28,28]"]
+SHORT = ["--policy.gradient_checkpointing=true", "--policy.geometry_source=none"]
 
 
 def plan(*arguments: str) -> str:
@@ -55,7 +56,7 @@ def test_proposals_with_the_command_that_trains_them():
 
 def test_lora_starts_from_a_checkpoint_and_needs_less():
     pytest.importorskip("peft")
-    shown = plan(*TINY, "--gpu", "8", "--proposals", "1", "--peft.r=3", "--policy.lora_targets=expert+vlm")
+    shown = plan(*TINY, "--gpu", "8", "--proposals", "1", "--peft.r=3", "--policy.lora_targets=expert+vlm", *SHORT)
     assert "LoRA on VLM and expert" in shown
     assert "1. lerobot-train --policy.path=CHECKPOINT " in shown
     assert "--policy.lora_targets=expert+vlm" in shown
