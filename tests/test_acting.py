@@ -176,9 +176,7 @@ def test_guidance_is_lerobots(left):
 
     plain = make_policy()
     images, masks = prepare_images(batch, plain.config, torch.device("cpu"))
-    context = plain.model._context(
-        images, masks, batch[TOKENS], batch[TOKEN_MASK], *plain._geometry_tokens(batch), None
-    )
+    context = plain.model._context(images, masks, batch[TOKENS], batch[TOKEN_MASK], *plain._measure(batch), None)
 
     def velocity(x_t: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
         return plain.model._velocity(*context, None, x_t, time)

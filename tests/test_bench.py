@@ -19,7 +19,7 @@ def test_an_observation_is_made_that_the_policy_accepts(geometry_source):
     batch = loaded.preprocess(random_observation(loaded.policy.config))
     assert loaded.policy.predict_action_chunk(batch).isfinite().all()
     if geometry_source == "rgbd":
-        assert loaded.policy._geometry_tokens(batch)[1].any()  # a wall is seen
+        assert loaded.policy._measure(batch)[1].any()  # a wall is seen
 
 
 def test_every_part_is_timed_and_the_parts_are_the_whole():

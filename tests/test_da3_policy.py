@@ -47,7 +47,7 @@ def test_rgb_alone_gives_geometry(encoder):
     policy, batch = make_da3(encoder), make_batch()
     assert policy.geometry.source.cameras == ("front", "wrist")
     assert torch.equal(chunk_of(policy, without(batch, *GEOMETRY)), chunk_of(policy, batch))
-    tokens, pad = policy._geometry_tokens(batch)
+    tokens, pad = policy._measure(batch)
     assert tokens.shape[1] == 2 * 3 * 3
     assert pad.all()
     plain = make_policy(geometry_source="none")
@@ -154,7 +154,7 @@ def test_a_camera_under_lerobots_short_name_is_found(encoder):
 
 def test_a_camera_that_may_be_absent_is_left_out(encoder):
     policy, batch = make_da3(encoder, absent_cameras=[WRIST]), make_batch()
-    _, pad = policy._geometry_tokens(without(batch, WRIST))
+    _, pad = policy._measure(without(batch, WRIST))
     assert pad.unflatten(1, (2, 9)).all(dim=2).tolist() == [[True, False]] * 2
     absent = chunk_of(policy, without(batch, WRIST))
     black = chunk_of(policy, batch | {WRIST: torch.zeros_like(batch[WRIST])})

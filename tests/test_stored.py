@@ -115,8 +115,8 @@ def test_a_camera_that_fails_on_the_robot_is_masked_as_with_da3(root, tmp_path):
     policy.save_pretrained(tmp_path / "checkpoint")
     live = PI05GeometryPolicy.from_pretrained(tmp_path / "checkpoint")
     for acting in (policy, live):
-        acting._geometry_tokens(batch)
-        _, pad = acting._geometry_tokens(without(batch, WRIST))
+        acting._measure(batch)
+        _, pad = acting._measure(without(batch, WRIST))
         assert pad.unflatten(1, (2, 9)).all(dim=2).tolist() == [[True, False]] * len(INDICES)
 
 

@@ -302,7 +302,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         """Loss of every action entry (B, S, max_action_dim), the mean over flow samples."""
         device = self.training_step.device
         images, img_masks = prepare_images(batch, self.config, device)
-        embs, pad = self._geometry_tokens(batch)
+        embs, pad = (None, None) if self.geometry is None else self._measure(batch)
         if pad is not None and self.training:
             pad = pad & (draw.dropout.to(device) >= self.config.geometry_dropout)[:, None]
         losses: Tensor = self.model(
@@ -400,7 +400,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         images, img_masks = prepare_images(batch, self.config, self.training_step.device)
         geometry = None
         if self.geometry is not None:  # measured beside vision and prefix
-            geometry = PendingGeometry(self.geometry.source.num_tokens, partial(self.geometry, batch))
+            geometry = PendingGeometry(self.geometry.source.num_tokens, partial(self._measure, batch))
         actions = self.sampler(
             images,
             img_masks,
@@ -411,8 +411,10 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         )
         return actions[..., : self.config.action_feature.shape[0]]
 
-    def _geometry_tokens(self, batch: dict[str, Tensor]) -> GeometryTokens | tuple[None, None]:
-        return (None, None) if self.geometry is None else self.geometry(batch)
+    def _measure(self, batch: dict[str, Tensor]) -> GeometryTokens:
+        assert self.geometry is not None
+        tokens: GeometryTokens = self.geometry(batch)
+        return tokens
 
     def supports_rtc(self) -> bool:
         return True

@@ -2,10 +2,10 @@
 
 app   what they share        studies      demo, study                     simulation   record, train, evaluate
                              checkpoints  inspect, bench, convert, export, merge
-                             datasets     quantiles, precompute
+                             datasets     quantiles, precompute           planning     plan
 """
 
-from . import studies, simulation, checkpoints, datasets  # noqa: F401, I001 (the order of --help)
+from . import studies, simulation, checkpoints, datasets, planning  # noqa: F401, I001 (the order of --help)
 from .app import app, console
 
 __all__ = ["app", "console"]

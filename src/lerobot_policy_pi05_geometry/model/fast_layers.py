@@ -31,11 +31,18 @@ class SegmentFrame(NamedTuple):
     """What is the same in every layer of a segment: rotary tables (B, 1, N, D) float32, and the mask of its queries.
 
     masks: additive, one per layer or the same for all, each (B, 1 or KV, 1 or H / KV * N, K), or None where every key is seen.
+    written_out: attention as two products and a softmax instead of PyTorch's fused kernel.
     """
 
     cos: Tensor
     sin: Tensor
     masks: Sequence[Tensor | None]
+    written_out: bool
+
+
+def write_attention_out(kernels: str, dtype: torch.dtype) -> bool:
+    """Which way is faster on this type of device (benchmarks/attention.py)."""
+    return kernels == "cpu" and dtype == torch.bfloat16
 
 
 def run_layers(
@@ -61,7 +68,8 @@ def run_layers(
         if queries is None:
             break
         seen_keys, seen_values = keys[:, :, : span.stop], values[:, :, : span.stop]
-        attended = _attend(queries, seen_keys, seen_values, frame.masks[index])  # (B, KV, H / KV * N, D)
+        attend = _attend_in_products if frame.written_out else F.scaled_dot_product_attention
+        attended = attend(queries, seen_keys, seen_values, frame.masks[index])  # (B, KV, H / KV * N, D)
         heads = attended.unflatten(2, (-1, x.shape[1])).flatten(1, 2)  # (B, H, N, D)
         update = F.linear(heads.transpose(1, 2).flatten(2), weights.out)
         x = _add(x, update, modulation, 0)
@@ -95,10 +103,8 @@ def _attention_inputs(
     return turned[:, :heads].to(x.dtype).unflatten(1, (kv, -1)).flatten(2, 3)
 
 
-def _attend(queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
-    """softmax(q k^T / sqrt(D) + mask) v, by whichever way is faster (benchmarks/attention.py)."""
-    if queries.device.type != "cpu" or queries.dtype != torch.bfloat16:
-        return F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+def _attend_in_products(queries: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None) -> Tensor:
+    """softmax(q k^T / sqrt(D) + mask) v."""
     scores = torch.matmul(queries * queries.shape[-1] ** -0.5, keys.transpose(-1, -2)).float()
     if mask is not None:
         scores += mask

@@ -72,15 +72,14 @@ def _join(linears: list[nn.Linear], dtype: torch.dtype) -> Tensor:
 
 
 def _already_joined(weights: list[Tensor]) -> Tensor | None:
-    """The large matrix that these weights are the rows of, if they stand one after the other in memory."""
-    place = weights[0].data_ptr()
+    """The large matrix that these weights are the rows of, if they stand one after the other in one storage."""
+    storage, place = weights[0].untyped_storage(), weights[0].storage_offset()
     for weight in weights:
-        if weight.data_ptr() != place or not weight.is_contiguous():
+        same = weight.untyped_storage()._cdata == storage._cdata
+        if not same or weight.storage_offset() != place or not weight.is_contiguous():
             return None
-        place += weight.numel() * weight.element_size()
+        place += weight.numel()
     first, rows = weights[0].detach(), sum(weight.shape[0] for weight in weights)
-    if first.untyped_storage().nbytes() < (first.storage_offset() + rows * first.shape[1]) * first.element_size():
-        return None  # neighbours by chance, in storages of their own
     return first.as_strided((rows, first.shape[1]), (first.shape[1], 1))
 
 
@@ -100,7 +99,7 @@ class Weights:
         members = (id(member) for entries in self._members for member in entries.values())
         return (
             hash(tuple(members)),
-            hash(tuple(parameter.data_ptr() for parameter in self._parameters)),
+            hash(tuple((p.untyped_storage()._cdata, p.storage_offset()) for p in self._parameters)),
             sum(parameter._version for parameter in self._parameters),
         )
 

@@ -21,10 +21,11 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.utils._pytree import tree_leaves
 
 from .attention import rotary_table
 from .cache import SegmentKVCache
-from .fast_layers import LayerModulation, Modulation, SegmentFrame, adaptive_norm, run_layers
+from .fast_layers import LayerModulation, Modulation, SegmentFrame, adaptive_norm, run_layers, write_attention_out
 from .fused import FusedLayer, Weights, fuse
 from .gemma import AdaRMSNorm, GemmaModel
 from .layout import Segment, one_block, segment_mask, segment_positions
@@ -93,6 +94,12 @@ class ChunkRunner:
         self._clean = self._modulations(models[Segment.GEOMETRY], 0.0)[0]
         self._side = SideStream(self.device)
         self._weights = Weights(self.network)
+
+    def tensors(self) -> list[Tensor]:
+        """All that is kept between chunks; some of it is the network's own storage (fused.py)."""
+        leaves = tree_leaves([self._clean, *self._steps.values()])
+        matrices = (m for layers in self._layers.values() for layer in layers for m in vars(layer).values())
+        return [tensor for tensor in (*matrices, *leaves) if isinstance(tensor, Tensor)]
 
     def _modulations(self, model: GemmaModel, time: float) -> tuple[list[LayerModulation], Modulation]:
         """Of every layer of an expert and of its final norm, at one flow time."""
@@ -180,10 +187,13 @@ class ChunkRunner:
         """The prefix's keys and values in a new cache that has room for the other two segments."""
         assert prefix.embs is not None
         batch, length = prefix.pad.shape
-        cache = self.network.paligemma_with_expert.make_cache(batch, (length, *room), prefix.pad.device)
+        cache = self._make_cache(batch, (length, *room))
         frame = self._frame([prefix.pad, None, None], Segment.PREFIX)
         self._run(Segment.PREFIX, prefix.embs, frame, cache, None, output=False)
         return Context(prefix.pad, cache)
+
+    def _make_cache(self, batch: int, lengths: tuple[int, int, int]) -> SegmentKVCache:
+        return self.network.paligemma_with_expert.make_cache(batch, lengths, self.device)
 
     def prefill_geometry(self, context: Context, geometry: GeometryTokens | None) -> Tensor | None:
         """Keys and values of geometry, if there is any, into the cache. Returns its mask."""
@@ -227,7 +237,8 @@ class ChunkRunner:
         assert positions is not None
         cos, sin = rotary_table(positions, self.config.expert.head_dim)
         cos, sin = torch.cat([cos, cos], dim=-1), torch.cat([-sin, sin], dim=-1)
-        return SegmentFrame(cos[:, None], sin[:, None], self._masks(segment, pads))
+        written_out = write_attention_out(self.kernels, self.config.dtype)
+        return SegmentFrame(cos[:, None], sin[:, None], self._masks(segment, pads), written_out)
 
     def _masks(self, segment: Segment, pads: Sequence[Tensor | None]) -> list[Tensor | None]:
         """Additive masks of a segment, per layer."""
@@ -236,7 +247,7 @@ class ChunkRunner:
         depth, geometry_pad = self.config.expert.depth, pads[Segment.GEOMETRY]
         gate = self.network.paligemma_with_expert.geometry_gate
         # A float32 mask keeps the gate's digits; CUDA has no fast kernel for one beside bf16 queries.
-        dtype = torch.float32 if seen.device.type == "cpu" else self.config.dtype
+        dtype = torch.float32 if self.kernels == "cpu" else self.config.dtype
         hidden = torch.zeros(seen.shape, dtype=dtype, device=seen.device).masked_fill(~seen, torch.finfo(dtype).min)
         hidden = hidden[:, None]  # (B, 1, 1, K)
         if segment is Segment.SUFFIX and gate is not None and geometry_pad is not None:
@@ -250,9 +261,12 @@ class ChunkRunner:
                 rows = bias.unflatten(0, (heads, -1))[:, :, None].expand(-1, -1, queries, -1).flatten(1, 2)
                 masks.append(hidden + rows)
             return masks
-        if self._may_look and bool(seen.all()):
-            return [None] * depth
-        return [hidden] * depth
+        return [None if self._may_look and bool(seen.all()) else hidden] * depth
+
+    @property
+    def kernels(self) -> str:
+        """Type of the device whose kernels decide how things are computed."""
+        return self.device.type
 
     @property
     def _may_look(self) -> bool:

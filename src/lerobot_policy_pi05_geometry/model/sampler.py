@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from .config import RunnerName
+from .fast_layers import write_attention_out
 from .graphs import PROMPT_STEP, GraphRunner
 from .pi05 import PI05Pytorch
 from .runner import ChunkRunner, why_not
@@ -71,12 +72,19 @@ class ChunkSampler:
         self._runners = {kind: built for kind, built in self._runners.items() if built.device == self._device}
         try:
             if wanted not in self._runners:
-                self._runners[wanted] = wanted(network)
+                self._runners[wanted] = self._make_runner(wanted)
             self._runners[wanted].refresh()
         except TypeError as error:
             self._runners.clear()
             return str(error)
         return None
+
+    def _make_runner(self, kind: type[ChunkRunner]) -> ChunkRunner:
+        return kind(self._network)
+
+    def tensors(self) -> list[Tensor]:
+        """All that is kept between chunks; some of it is the network's own storage (fused.py)."""
+        return [tensor for runner in self._runners.values() for tensor in runner.tensors()]
 
     def explain(self, runner: RunnerName = "fast") -> dict[str, str]:
         """What is active and what was declined, and why, for a person to read. runner: the one that is asked for."""
@@ -90,8 +98,7 @@ class ChunkSampler:
             layer.self_attn.q_proj.weight.dtype == network.config.dtype
             for layer in network.paligemma_with_expert.expert.layers
         )
-        on_cpu = self._device.type == "cpu"
-        written_out = on_cpu and network.config.dtype == torch.bfloat16
+        written_out = write_attention_out(self._device.type, network.config.dtype)
         return {
             "runner": "active",
             "matrices": "joined (q, k, v; gate, up), "

@@ -1,0 +1,171 @@
+"""Settings that fit a GPU, best first: as close to full fine-tuning as it goes, then as many samples at once as it goes.
+
+What the user has fixed stays fixed. Of the rest a recipe says what is trained and how; for each the largest (micro-)batch that
+fits is looked for, a power of two below the wanted batch. Gradient checkpointing is given up where the wanted batch fits without.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from ..configuration_pi05_geometry import PI05GeometryConfig
+from .adapters import why_not
+from .counting import MemorySplit
+from .gpus import GIB, needed
+from .workload import FakePolicy, Load
+
+RANK = 16  # of LoRA, where the user has given none; lerobot-train's default
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is trained, and how. settings: of the policy's configuration, in addition to the defaults of `_PLAIN`."""
+
+    name: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    lora: bool = False
+
+    def all_settings(self) -> dict[str, Any]:
+        return {**_PLAIN, **self.settings}
+
+    def without_optimizer(self) -> tuple[Any, ...]:
+        """What tells recipes apart whose passes forward and backward are the same."""
+        return (*sorted((k, v) for k, v in self.all_settings().items() if k != "optimizer"), self.lora)
+
+
+# float32 weights, bfloat16 products. Weights that LoRA leaves frozen lose nothing in bfloat16, which is what they are used in.
+_PLAIN = {
+    "dtype": "bfloat16", "param_dtype": "float32", "train_expert_only": False, "freeze_vision_encoder": False,
+    "optimizer": "adamw",
+}  # fmt: skip
+_NO_VISION, _EXPERT = {"freeze_vision_encoder": True}, {"train_expert_only": True}
+_FROZEN_BF16 = {"param_dtype": "bfloat16"}
+_8_BIT = {"optimizer": "adamw8bit"}
+
+# Best first.
+RECIPES = (
+    Recipe("full fine-tuning"),
+    Recipe("full fine-tuning, 8-bit AdamW", _8_BIT),
+    Recipe("all but the vision tower", _NO_VISION),
+    Recipe("all but the vision tower, 8-bit AdamW", _NO_VISION | _8_BIT),
+    Recipe("LoRA on VLM and expert", _FROZEN_BF16 | {"lora_targets": "expert+vlm"}, lora=True),
+    Recipe("action expert only", _EXPERT),
+    Recipe("action expert only, 8-bit AdamW", _EXPERT | _8_BIT),
+    Recipe("LoRA on the expert", _FROZEN_BF16 | {"lora_targets": "expert"}, lora=True),
+)
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """What the user has fixed: settings of the policy by name, and the rank of LoRA, None where LoRA is open."""
+
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    lora_rank: int | None = None
+
+    def allows(self, recipe: Recipe) -> bool:
+        wanted = {name: value for name, value in recipe.all_settings().items() if name != "dtype"}
+        if any(self.settings.get(name, value) != value for name, value in wanted.items()):
+            return False
+        return recipe.lora or self.lora_rank is None
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A recipe that fits, with what it needs. fixed: what the user had fixed."""
+
+    recipe: Recipe
+    checkpointing: bool
+    load: Load
+    split: MemorySplit
+    fixed: Fixed = Fixed()
+
+    def options(self) -> list[str]:
+        """What to give to lerobot-train for it."""
+        said = {name: value for name, value in self.recipe.all_settings().items() if value not in (False, "float32")}
+        said |= {"gradient_checkpointing": self.checkpointing, "micro_batch_size": 0}
+        if self.load.rows < self.load.batch_size:
+            said["micro_batch_size"] = self.load.rows
+        said |= {name: value for name, value in self.fixed.settings.items() if name != "micro_batch_size"}
+        said = {name: value for name, value in said.items() if (name, value) not in _DEFAULTS}
+        written = [f"--policy.{name}={str(value).lower()}" for name, value in said.items()]
+        peft = [f"--peft.r={self.fixed.lora_rank or RANK}"] if self.recipe.lora else []
+        return [*written, *peft, f"--batch_size={self.load.batch_size}"]
+
+
+_DEFAULTS = [("micro_batch_size", 0), ("gradient_checkpointing", False), ("optimizer", "adamw")]
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A recipe that is not proposed, and why, as the rest of a sentence; unavailable: whatever the GPU."""
+
+    recipe: Recipe
+    why: str
+    unavailable: bool = False
+
+
+def propose(
+    make_config: Callable[[Mapping[str, Any]], PI05GeometryConfig],
+    load: Load,
+    budget: int,
+    fixed: Fixed = Fixed(),
+    da3: Any = None,
+) -> Iterator[Proposal | Rejection]:
+    """Every recipe in turn, best first, as a proposal or a rejection.
+
+    make_config: settings -> a complete configuration. load: the wanted batch. budget: bytes of the GPU.
+    """
+    built: dict[Any, FakePolicy] = {}
+    at_ease: set[Any] = set()  # what fits with the whole batch at once
+    for recipe in RECIPES:
+        if not fixed.allows(recipe) or recipe.without_optimizer() in at_ease:  # at ease, 8 bits would gain nothing
+            continue
+        reason = why_not() if recipe.lora else None
+        if reason is not None:
+            yield Rejection(recipe, reason, unavailable=True)
+            continue
+
+        def predict(rows: int, checkpointing: bool, recipe: Recipe = recipe) -> tuple[Load, MemorySplit]:
+            key = (recipe.without_optimizer(), checkpointing)
+            if key not in built:
+                settings = recipe.all_settings() | {"gradient_checkpointing": checkpointing}
+                rank = (fixed.lora_rank or RANK) if recipe.lora else None
+                built[key] = FakePolicy(make_config(settings | dict(fixed.settings)), rank, da3)
+            policy = built[key]
+            asked = replace(load, micro_batch_size=rows, optimizer=recipe.all_settings()["optimizer"])
+            floor = policy.resident(asked)  # seconds are spared where this alone is too much
+            return asked, floor if needed(floor) > budget else policy.training(asked)
+
+        outcome = _largest(recipe, predict, load, budget, fixed)
+        if isinstance(outcome, Proposal) and outcome.load.rows == load.batch_size:
+            at_ease.add(recipe.without_optimizer())
+        yield outcome
+
+
+def _largest(
+    recipe: Recipe,
+    predict: Callable[[int, bool], tuple[Load, MemorySplit]],
+    wanted: Load,
+    budget: int,
+    fixed: Fixed,
+) -> Proposal | Rejection:
+    """The recipe with the largest micro-batch that fits; see the module's text for what is tried."""
+    checkpointing = fixed.settings.get("gradient_checkpointing")
+    rows = wanted.rows
+    while rows:
+        asked, split = predict(rows, checkpointing is not False)
+        if needed(split) <= budget:
+            if checkpointing is None and rows == wanted.rows:
+                plain = predict(rows, False)
+                if needed(plain[1]) <= budget:
+                    return Proposal(recipe, False, *plain, fixed)
+            return Proposal(recipe, checkpointing is not False, asked, split, fixed)
+        # Activations grow with the batch in a straight line, and not from zero: this guess is rarely too small.
+        spare = budget - needed(replace(split, activations=0))
+        if split.activations == 0 or (spare <= 0 and rows == 1) or fixed.settings.get("micro_batch_size"):
+            break
+        guess = max(1, int(rows * max(spare, 0) / (needed(split) - needed(replace(split, activations=0)))))
+        rows = min(rows - 1, guess)
+        rows = 1 << (rows.bit_length() - 1) if rows else 0
+    what = "weights, gradients and optimiser alone" if split.activations == 0 else f"{rows or 1} at once"
+    return Rejection(recipe, f"{what} need {needed(split) / GIB:.1f} GiB")
