@@ -169,7 +169,9 @@ def split(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) ->
         pad = timed("geometry", partial(runner.prefill_geometry, context, geometry))
         timed("denoising", partial(runner.denoise, context, noise, pad, steps))
         if theirs is not None:
-            ratios.append(times["denoising"][-1] / steps / min(seconds(theirs, args.device) for _ in range(2)))
+            ratios.append(
+                times["denoising"][-1] / steps / statistics.mean(seconds(theirs, args.device) for _ in range(3))
+            )
     parts = {part: statistics.median(values[1:]) for part, values in times.items()}
     return parts, statistics.median(ratios[1:]) if ratios else None
 
