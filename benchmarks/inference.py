@@ -33,7 +33,7 @@ from lerobot_policy_pi05_geometry.geometry.da3.encoder import store_products_in
 from lerobot_policy_pi05_geometry.model import PI05Pytorch
 from lerobot_policy_pi05_geometry.model.fast_layers import run_layers
 from lerobot_policy_pi05_geometry.model.graphs import GraphRunner
-from lerobot_policy_pi05_geometry.model.runner import ChunkRunner, Observation
+from lerobot_policy_pi05_geometry.model.runner import Chunk, ChunkRunner, Observation
 from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.model.side_stream import GeometryTokens, PendingGeometry
 
@@ -46,8 +46,28 @@ PAIRS = {
 }
 
 
-class CompiledLayers(ChunkRunner):
-    """A runner with compiled layers. Policies do not have it: on a CPU it gains nothing and takes long (docs/results.md)."""
+class CompiledWhole(ChunkRunner):
+    """A runner whose whole chunk is one compiled function. Policies do not have it: on a CPU it gains little and takes long."""
+
+    def _build(self) -> None:
+        super()._build()
+        self._schedule(self.config.num_inference_steps)
+        self._whole = torch.compile(self._both, dynamic=False, options={"max_autotune": True, "cpp_wrapper": True})
+
+    def _both(self, observation, early, noise, late, room, num_steps):
+        return self.act(self.look(observation, early, room), noise, late, num_steps)
+
+    def _chunk(self, observation, noise, num_steps, num_tokens):
+        room = (0 if self.network.geometry_in_prefix else num_tokens, noise.shape[1])
+        return Chunk(lambda *seen: seen, lambda seen, noise, late: self._whole(*seen, noise, late, room, num_steps))
+
+    @property
+    def _may_look(self) -> bool:
+        return False
+
+
+class CompiledGraphs(GraphRunner):
+    """A runner with compiled layers, recorded."""
 
     def _build(self) -> None:
         super()._build()
@@ -56,10 +76,6 @@ class CompiledLayers(ChunkRunner):
     def _run(self, segment, embs, frame, cache, modulations, output):
         x, layers = embs.to(self.config.dtype), self._layers[segment]
         return self._compiled(x, layers, self.config.expert, frame, cache, cache.span(segment), modulations, output)
-
-
-class CompiledGraphs(CompiledLayers, GraphRunner):
-    """The same, recorded."""
 
 
 def synchronise(device: str) -> None:
@@ -122,7 +138,7 @@ def chunk_functions(
         functions |= {BESIDE: lambda: sample(geometry=pending), BEFORE: before}
     if "ours" in args.compiled:
         torch._dynamo.config.recompile_limit = 64  # every number of cameras is a shape of its own
-        own_compiled = CompiledLayers(ours) if args.device == "cpu" else CompiledGraphs(ours)
+        own_compiled = CompiledWhole(ours) if args.device == "cpu" else CompiledGraphs(ours)
         functions[OWN_COMPILED] = lambda: own_compiled(*short, noise=noise, geom_embs=tokens)
     if "lerobot" in args.compiled:
         compiled = torch.compile(lerobot.sample_actions, mode="max-autotune")  # as LeRobot's compile_model does
@@ -265,7 +281,7 @@ def main() -> None:
         choices=("lerobot", "ours"),
         nargs="+",
         default=[],
-        help="also LeRobot's with compile_model=True (minutes of compiling), or the runner's layers (half a minute)",
+        help="also LeRobot's with compile_model=True (minutes of compiling), or the runner's (a minute per number of cameras)",
     )
     parser.add_argument("--chunk", type=int, default=50, help="action steps")
     parser.add_argument("--prompt", type=int, default=100, help="prompt tokens; a state of 14 numbers takes some 70")
