@@ -110,7 +110,7 @@ class ChunkSampler:
             "geometry": self._explain_geometry(),
             "real-time chunking": "declined: the plain path serves it",
             **self._explain_graphs(runner),
-            "compilation": "left out: on a CPU chunks were no faster for it (docs/results.md); on a GPU it has not been measured",
+            "compilation": "left out: on a CPU it gains less than it costs (docs/results.md); on a GPU it has not been measured",
         }
 
     def _explain_geometry(self) -> str:
