@@ -25,9 +25,9 @@ class CountedSide(SideStream):
         self._counter = counter
 
     def run[T](self, work: Callable[[], T]) -> T:
-        kept = torch.empty(self._counter.spare, dtype=torch.uint8)
+        graphs_keep = torch.empty(self._counter.spare, dtype=torch.uint8)
         result = work()
-        del kept
+        del graphs_keep
         return result
 
 
