@@ -1,6 +1,9 @@
 """The runner's chunks, recorded and done again (see tape.py for how without a GPU), equal the runner's, shape after shape."""
 
 import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -263,6 +266,44 @@ def test_the_eager_runner_looks_on_a_cpu() -> None:
     batch = draw(network, Case(seed=13))
     with pytest.raises(RuntimeError, match="A GPU would be waited for"), Tape():
         chunk(ChunkRunner(network), batch)
+
+
+class Streams:
+    """Instead of `torch.cuda`: who waited for whom, and what ran where."""
+
+    def __init__(self) -> None:
+        self.log: list[str] = []
+        self.here = "main"
+
+    def stream(self, name: str) -> SimpleNamespace:
+        return SimpleNamespace(
+            device=None, name=name, wait_stream=lambda other: self.log.append(f"{name} waits for {other.name}")
+        )
+
+    @contextmanager
+    def on(self, stream: SimpleNamespace, what: str) -> Iterator[None]:
+        before, self.here = self.here, f"{stream.name}{what}"
+        yield
+        self.here = before
+
+    def patch(self, monkeypatch) -> None:
+        monkeypatch.setattr(torch.cuda, "Stream", lambda device: self.stream("side"))
+        monkeypatch.setattr(torch.cuda, "current_stream", lambda device: self.stream("main"))
+        monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 1))
+        monkeypatch.setattr(torch.cuda, "stream", lambda stream: self.on(stream, ""))
+        monkeypatch.setattr(torch.cuda, "graph", lambda graph, *, stream, **_: self.on(stream, ", recorded"))
+        replay = lambda: self.log.append("replay")  # noqa: E731
+        monkeypatch.setattr(torch.cuda, "CUDAGraph", lambda: SimpleNamespace(replay=replay))
+
+
+def test_a_replay_waits_for_the_warming_up(monkeypatch) -> None:
+    """Both write into the same cache, and `torch.cuda.graph` waits on the current device only, which may be another."""
+    streams = Streams()
+    streams.patch(monkeypatch)
+    result, replay = CudaGraphRecorder(torch.device("cuda:1")).record(lambda: streams.log.append(streams.here) or 7)
+    replay()
+    assert result == 7
+    assert streams.log == ["side waits for main", *3 * ["side"], "main waits for side", "side, recorded", "replay"]
 
 
 # --- on a GPU -----------------------------------------------------------------------------------------------------

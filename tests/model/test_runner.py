@@ -138,6 +138,13 @@ def step_of_training(network: PI05Pytorch) -> None:
     torch.optim.SGD(network.parameters(), lr=0.05).step()
 
 
+def step_of_a_fused_optimiser(network: PI05Pytorch) -> None:
+    """Which writes without leaving a trace in the parameters' versions."""
+    for parameter in network.parameters():
+        parameter.grad = torch.randn_like(parameter)
+    torch.optim.AdamW(network.parameters(), lr=0.05, fused=True).step()
+
+
 def another_checkpoint(network: PI05Pytorch) -> None:
     other = build_network(network.config.geometry, seed=77)
     network.load_state_dict(other.state_dict())
@@ -161,9 +168,27 @@ def new_modules(network: PI05Pytorch) -> None:
         layer.mlp.up_proj = fresh
 
 
+def new_modules_where_old_ones_were(network: PI05Pytorch) -> None:
+    """As when something wraps a projection, and hands another one back: nothing of the old one is left, but maybe its address."""
+    for layer in network.paligemma_with_expert.expert.layers:
+        shape = layer.mlp.up_proj.in_features, layer.mlp.up_proj.out_features
+        layer.mlp.up_proj = nn.Identity()
+        layer.mlp.up_proj = nn.Linear(*shape, bias=False)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize(
-    "change", [step_of_training, another_checkpoint, new_tensors, new_parameters, new_modules], ids=lambda f: f.__name__
+    "change",
+    [
+        step_of_training,
+        step_of_a_fused_optimiser,
+        another_checkpoint,
+        new_tensors,
+        new_parameters,
+        new_modules,
+        new_modules_where_old_ones_were,
+    ],
+    ids=lambda f: f.__name__,
 )
 def test_weights_that_changed_after_building_act(change, dtype: torch.dtype) -> None:
     """Joined in place (float32) or copied (bf16 over float32), stale matrices and modulations never act."""

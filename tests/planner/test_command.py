@@ -105,6 +105,19 @@ def test_a_checkpoints_own_settings(tmp_path):
     assert "30 x 40, 28 x 28" in plan(f"--policy.path={tmp_path}", "--explain", "--policy.chunk_size=9")
 
 
+def test_a_proposal_says_what_the_checkpoint_has_otherwise(tmp_path):
+    """What a checkpoint brings along stays unless it is said; what agrees with it is left out."""
+    from tests.doors import make_config
+
+    brought = {"dtype": "bfloat16", "param_dtype": "bfloat16", "train_expert_only": True, "optimizer": "adamw8bit"}
+    make_config(geometry_source="none", gradient_checkpointing=True, **brought)._save_pretrained(tmp_path)
+    shown = plan(f"--policy.path={tmp_path}", "--gpu", "8", "--proposals", "1")
+    said = set(shown.split("lerobot-train ")[1].split())
+    assert {f"--policy.path={tmp_path}", "--policy.param_dtype=float32", "--policy.train_expert_only=false"} <= said
+    assert {"--policy.optimizer=adamw", "--policy.gradient_checkpointing=false"} <= said
+    assert not {option for option in said if option.startswith(("--policy.dtype", "--policy.micro", "--policy.freeze"))}
+
+
 @pytest.mark.parametrize("name", [n for n in VARIANTS if n != "tiny"])
 def test_encoders_by_their_released_names(name):
     assert da3_variant(f"depth-anything/DA3-{name.upper()}") is VARIANTS[name]

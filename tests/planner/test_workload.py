@@ -238,6 +238,15 @@ def test_depth_anything_has_a_purpose_of_its_own():
     assert planned.training(load(2)).weights == planned.weights()
 
 
+@pytest.mark.parametrize("placement", ["segment", "prefix"])
+def test_beside_graphs_what_measures_needs_memory_of_its_own(placement):
+    """Whether geometry is measured after the first half of a chunk or, where it stands in the prefix, before."""
+    changes = {"geometry_source": "da3", "calibration": {}, "da3_image_size": 42, "geometry_placement": placement}
+    planned = FakePolicy(make_config(**changes), None, VARIANTS["tiny"])
+    on_cuda, on_cpu = (planned.inference(load(8, target=target)).total for target in ("cuda", "cpu"))
+    assert on_cuda - on_cpu > 2**18  # rounding to CUDA's blocks is less than half of it
+
+
 def test_on_cuda_pure_bf16_layer_norms_are_float32():
     """As CUDA's autocast has it, and the CPU's has not: what the vision tower remembers grows."""
     changes = {"dtype": "bfloat16", "param_dtype": "bfloat16"}

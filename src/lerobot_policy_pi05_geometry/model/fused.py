@@ -9,12 +9,26 @@ is held twice, and what changes the one in place changes the other. Otherwise (b
 matrices are copies; `Weights.stale` tells when the network has moved on.
 """
 
+from collections import Counter
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from .gemma import GemmaLayer, GemmaModel, RMSNorm
+
+_DONE: Counter[str] = Counter()  # "steps" of any optimiser of this process
+
+
+def _count_step(*_: Any) -> None:
+    _DONE["steps"] += 1
+
+
+register_optimizer_step_post_hook(
+    _count_step
+)  # torch's fused optimisers leave the versions of what they write as they were
 
 
 @dataclass(frozen=True)
@@ -86,21 +100,26 @@ def _already_joined(weights: list[Tensor]) -> Tensor | None:
 class Weights:
     """Remembers a network's modules and parameters, to notice when any was written to, replaced or moved.
 
-    But not a write through `parameter.data`, of which torch keeps no account.
+    But not a write through `parameter.data`, of which torch keeps no account. Any optimiser's step counts as a write.
     """
 
     def __init__(self, network: nn.Module) -> None:
-        modules = list(network.modules())
-        self._members = [entries for module in modules for entries in (module._modules, module._parameters) if entries]
+        self._modules = list(
+            network.modules()
+        )  # held, or a module that comes later could have the address of one that went
+        self._members = [
+            entries for module in self._modules for entries in (module._modules, module._parameters) if entries
+        ]
         self._parameters = list(network.parameters())
         self._seen = self._look()
 
-    def _look(self) -> tuple[int, int, int]:
+    def _look(self) -> tuple[int, int, int, int]:
         members = (id(member) for entries in self._members for member in entries.values())
         return (
             hash(tuple(members)),
             hash(tuple((p.untyped_storage()._cdata, p.storage_offset()) for p in self._parameters)),
             sum(parameter._version for parameter in self._parameters),
+            _DONE["steps"],
         )
 
     def stale(self) -> bool:

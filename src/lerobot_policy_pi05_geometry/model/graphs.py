@@ -46,10 +46,12 @@ class CudaGraphRecorder:
         self._pool = torch.cuda.graph_pool_handle()
 
     def record[T](self, work: Callable[[], T]) -> tuple[T, Callable[[], None]]:
-        self._stream.wait_stream(torch.cuda.current_stream(self._stream.device))
+        main = torch.cuda.current_stream(self._stream.device)
+        self._stream.wait_stream(main)
         with torch.cuda.stream(self._stream):
             for _ in range(_WARM_UP):
                 work()
+        main.wait_stream(self._stream)  # warming up writes into a cache that the first replay writes into
         graph = torch.cuda.CUDAGraph()
         # What other threads do on the GPU in the meantime, those of cameras say, is no part of the graph and no error.
         with torch.cuda.graph(graph, pool=self._pool, stream=self._stream, capture_error_mode="thread_local"):

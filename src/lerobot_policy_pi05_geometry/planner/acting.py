@@ -1,6 +1,7 @@
 """Sampling of action chunks on fake tensors: the runner and the plain path as they are, but for what needs values."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -8,9 +9,9 @@ from torch import Tensor
 
 from ..model.cache import SegmentKVCache
 from ..model.pi05 import PI05Pytorch
-from ..model.runner import ChunkRunner
+from ..model.runner import ChunkRunner, Context, Observation
 from ..model.sampler import ChunkSampler
-from ..model.side_stream import SideStream
+from ..model.side_stream import GeometryTokens, SideStream
 from .counting import MemoryCounter
 
 Target = Literal["cuda", "cpu"]
@@ -46,6 +47,11 @@ class CountedRunner(ChunkRunner):
 
     def _schedule(self, num_steps: int) -> list[Any]:
         return super()._schedule(self.config.num_inference_steps)[:num_steps]  # all are kept, however few are run here
+
+    def look(self, observation: Observation, geometry: GeometryTokens | None, room: tuple[int, int]) -> Context:
+        """Geometry that was measured before has used memory that is not the graph's: the two add up in this order, too."""
+        look = partial(super().look, observation, geometry, room)
+        return look() if geometry is None else self._side.run(look)
 
     def _make_cache(self, batch: int, lengths: tuple[int, int, int]) -> SegmentKVCache:
         cache = super()._make_cache(batch, lengths)

@@ -71,28 +71,24 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A recipe that fits, with what it needs. fixed: what the user had fixed."""
+    """A recipe that fits, with what it needs. fixed: what the user had fixed. unsaid: settings there are without any option."""
 
     recipe: Recipe
     checkpointing: bool
     load: Load
     split: MemorySplit
     fixed: Fixed = Fixed()
+    unsaid: Mapping[str, Any] = field(default_factory=dict)
 
     def options(self) -> list[str]:
-        """What to give to lerobot-train for it."""
-        said = {name: value for name, value in self.recipe.all_settings().items() if value not in (False, "float32")}
-        said |= {"gradient_checkpointing": self.checkpointing, "micro_batch_size": 0}
-        if self.load.rows < self.load.batch_size:
-            said["micro_batch_size"] = self.load.rows
-        said |= {name: value for name, value in self.fixed.settings.items() if name != "micro_batch_size"}
-        said = {name: value for name, value in said.items() if (name, value) not in _DEFAULTS}
+        """What to give to lerobot-train for it: what the user gave, and what a checkpoint or the defaults have otherwise."""
+        rows, whole, given = self.load.rows, self.load.batch_size, self.fixed.settings
+        wanted = self.recipe.all_settings() | {"gradient_checkpointing": self.checkpointing} | dict(given)
+        wanted["micro_batch_size"] = rows if rows < whole else 0
+        said = {name: value for name, value in wanted.items() if name in given or value != self.unsaid.get(name)}
         written = [f"--policy.{name}={str(value).lower()}" for name, value in said.items()]
         peft = [f"--peft.r={self.fixed.lora_rank or RANK}"] if self.recipe.lora else []
-        return [*written, *peft, f"--batch_size={self.load.batch_size}"]
-
-
-_DEFAULTS = [("micro_batch_size", 0), ("gradient_checkpointing", False), ("optimizer", "adamw")]
+        return [*written, *peft, f"--batch_size={whole}"]
 
 
 @dataclass(frozen=True)
@@ -116,6 +112,8 @@ def propose(
     make_config: settings -> a complete configuration. load: the wanted batch. budget: bytes of the GPU.
     """
     built: dict[Any, FakePolicy] = {}
+    plain = make_config({})
+    unsaid = vars(plain) | {"micro_batch_size": plain.micro_batch_size or 0}
     at_ease: set[Any] = set()  # what fits with the whole batch at once
     for recipe in RECIPES:
         if not fixed.allows(recipe) or recipe.without_optimizer() in at_ease:  # at ease, 8 bits would gain nothing
@@ -139,7 +137,7 @@ def propose(
         outcome = _largest(recipe, predict, load, budget, fixed)
         if isinstance(outcome, Proposal) and outcome.load.rows == load.batch_size:
             at_ease.add(recipe.without_optimizer())
-        yield outcome
+        yield replace(outcome, unsaid=unsaid) if isinstance(outcome, Proposal) else outcome
 
 
 def _largest(
