@@ -31,6 +31,10 @@ register_optimizer_step_post_hook(
 )  # torch's fused optimisers leave the versions of what they write as they were
 
 
+class NotPlainError(TypeError):
+    """A projection cannot be joined with others."""
+
+
 @dataclass(frozen=True)
 class FusedLayer:
     """One layer's matrices, (out, in) in the compute dtype, and the plain norms' scales, (W,) float32 or None."""
@@ -44,7 +48,7 @@ class FusedLayer:
 
 
 def fuse(model: GemmaModel, dtype: torch.dtype) -> list[FusedLayer]:
-    """All layers of a segment's transformer. Raises TypeError for a projection that is not a plain linear layer."""
+    """All layers of a segment's transformer. Raises NotPlainError for a projection that is not a plain linear layer."""
     return [_fuse_layer(layer, dtype) for layer in model.layers]
 
 
@@ -69,7 +73,7 @@ def norm_scale(norm: nn.Module) -> Tensor | None:
 def _join(linears: list[nn.Linear], dtype: torch.dtype) -> Tensor:
     for linear in linears:
         if type(linear) is not nn.Linear or linear.bias is not None:
-            raise TypeError(f"a projection is a {type(linear).__name__}, not a plain linear layer")
+            raise NotPlainError(f"a projection is a {type(linear).__name__}, not a plain linear layer")
     weights = [linear.weight for linear in linears]
     if weights[0].dtype != dtype:
         return torch.cat([weight.detach().to(dtype) for weight in weights])

@@ -66,7 +66,7 @@ def why_not(network: PI05Pytorch) -> str | None:
 
 
 class ChunkRunner:
-    """Runs a network. Raises TypeError for projections that are not plain linear layers (an unmerged LoRA)."""
+    """Runs a network. Raises NotPlainError for projections that are not plain linear layers (an unmerged LoRA)."""
 
     def __init__(self, network: PI05Pytorch) -> None:
         self.network, self.config = network, network.config

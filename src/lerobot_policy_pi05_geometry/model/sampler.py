@@ -8,6 +8,7 @@ from torch import Tensor
 
 from .config import RunnerName
 from .fast_layers import write_attention_out
+from .fused import NotPlainError
 from .graphs import PROMPT_STEP, GraphRunner
 from .pi05 import PI05Pytorch
 from .runner import ChunkRunner, why_not
@@ -74,7 +75,7 @@ class ChunkSampler:
             if wanted not in self._runners:
                 self._runners[wanted] = self._make_runner(wanted)
             self._runners[wanted].refresh()
-        except TypeError as error:
+        except NotPlainError as error:
             self._runners.clear()
             return str(error)
         return None

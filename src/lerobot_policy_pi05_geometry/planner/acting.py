@@ -34,15 +34,15 @@ class CountedSide(SideStream):
 class CountedRunner(ChunkRunner):
     """A runner whose matrices are weights and whose cache is a cache to the counter."""
 
-    def __init__(self, network: PI05Pytorch, counter: MemoryCounter, target: Target) -> None:
-        self._counter, self._target = counter, target
+    def __init__(self, network: PI05Pytorch, counter: MemoryCounter, target: Target, graphs: bool) -> None:
+        self._counter, self._target, self._graphs = counter, target, graphs
         super().__init__(network)
 
     def _build(self) -> None:
         with self._counter.naming("weights"):
             super()._build()
             self._schedule(self.config.num_inference_steps)  # of the chunk before
-        if self._target == "cuda":
+        if self._graphs:
             self._side = CountedSide(self._counter)
 
     def _schedule(self, num_steps: int) -> list[Any]:
@@ -75,13 +75,14 @@ class CountedSampler(ChunkSampler):
         self._counter, self._target = counter, target
 
     def __call__(self, *observation: Any, **kwargs: Any) -> Tensor:
+        self._graphs = self._target == "cuda" and kwargs.get("runner") == "fast"
         hook = self._network.paligemma_with_expert.register_forward_pre_hook(self._label_cache, with_kwargs=True)
         chunk = super().__call__(*observation, **kwargs)
         hook.remove()
         return chunk
 
     def _make_runner(self, kind: type[ChunkRunner]) -> ChunkRunner:
-        return CountedRunner(self._network, self._counter, self._target)
+        return CountedRunner(self._network, self._counter, self._target, self._graphs)
 
     def _label_cache(self, _: Any, __: Any, given: Mapping[str, Any]) -> None:
         cache = given.get("past_key_values")
