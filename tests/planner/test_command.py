@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lerobot_policy_pi05_geometry.cli import app
+from lerobot_policy_pi05_geometry.commands.app import console
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
 from lerobot_policy_pi05_geometry.planner.options import da3_variant
 
@@ -15,8 +16,14 @@ TINY = ["--policy.paligemma_variant=tiny", "--policy.action_expert_variant=tiny"
 SHORT = ["--policy.gradient_checkpointing=true", "--policy.geometry_source=none"]
 
 
+@pytest.fixture(autouse=True)
+def wide(monkeypatch):
+    """Tables that break no words, whatever the width was when the console was made."""
+    monkeypatch.setattr(console, "width", 200)
+
+
 def plan(*arguments: str) -> str:
-    result = CliRunner().invoke(app, ["plan", *arguments], env={"COLUMNS": "200"})
+    result = CliRunner().invoke(app, ["plan", *arguments])
     assert result.exit_code == 0, result.output + repr(result.exception)
     return " ".join(result.output.split())
 
