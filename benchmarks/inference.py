@@ -52,7 +52,6 @@ class CompiledWhole(ChunkRunner):
 
     def _build(self) -> None:
         super()._build()
-        self._schedule(self.config.num_inference_steps)
         self._whole = torch.compile(self._both, dynamic=False, options={"max_autotune": True, "cpp_wrapper": True})
 
     def _both(self, observation, early, noise, late, room, num_steps):

@@ -33,8 +33,8 @@ class NoCopies(TorchDispatchMode):
 class NoWeights:
     """Instead of a look at the addresses of weights, which fake ones do not have."""
 
-    def __init__(self, network) -> None:
-        pass
+    def __init__(self, network, copied) -> None:
+        assert not copied
 
     def stale(self) -> bool:
         return False

@@ -166,12 +166,28 @@ def test_prompts_of_similar_length_share_a_graph() -> None:
     assert len(runner.recorded) == 2
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_weights_that_changed_drop_what_was_recorded(dtype: torch.dtype) -> None:
-    network = build_network(SEGMENT, seed=39, dtype=dtype).eval()
+def test_what_is_recorded_reads_weights_as_they_are() -> None:
+    network = build_network(SEGMENT, seed=39).eval()
     runner, batch = recording(network), draw(network, Case(seed=10))
     before, recorder = chunk(runner, batch), runner._recorder
-    randomise(network, 40)
+    for parameter in network.parameters():
+        parameter.data.mul_(0.9)
+    after = chunk(runner, batch)
+    assert runner._recorder is recorder
+    assert not torch.allclose(before, after, atol=1e-3)
+    assert torch.allclose(after, chunk(recording(network), batch), atol=1e-6)
+
+
+@pytest.mark.parametrize("copies", [True, False])
+def test_weights_that_are_elsewhere_drop_what_was_recorded(copies: bool) -> None:
+    network = build_network(SEGMENT, seed=39, dtype=torch.bfloat16 if copies else torch.float32).eval()
+    runner, batch = recording(network), draw(network, Case(seed=10))
+    before, recorder = chunk(runner, batch), runner._recorder
+    if copies:
+        randomise(network, 40)
+    else:
+        for parameter in network.parameters():
+            parameter.data = parameter.data * 0.9
     after = chunk(runner, batch)
     assert runner._recorder is not recorder  # memory that nothing holds cannot be shared
     assert not torch.allclose(before, after, atol=1e-3)

@@ -155,6 +155,12 @@ def new_tensors(network: PI05Pytorch) -> None:
         parameter.data = parameter.data * 0.9
 
 
+def a_write_through_data(network: PI05Pytorch) -> None:
+    """As averages of weights are kept. Neither versions nor places tell."""
+    for parameter in network.parameters():
+        parameter.data.mul_(0.9)
+
+
 def new_parameters(network: PI05Pytorch) -> None:
     for module in network.modules():
         for name, parameter in list(module._parameters.items()):
@@ -184,6 +190,7 @@ def new_modules_where_old_ones_were(network: PI05Pytorch) -> None:
         step_of_a_fused_optimiser,
         another_checkpoint,
         new_tensors,
+        a_write_through_data,
         new_parameters,
         new_modules,
         new_modules_where_old_ones_were,
@@ -201,6 +208,33 @@ def test_weights_that_changed_after_building_act(change, dtype: torch.dtype) -> 
     assert not torch.allclose(before, after, atol=1e-3)
     fresh = ChunkRunner(copy.deepcopy(network))
     assert torch.allclose(after, fast(fresh, batch), atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_any_single_parameter_acts_as_it_is_now(dtype: torch.dtype) -> None:
+    """Written through `.data`, in whole, one parameter after the other: what is computed from weights is never kept."""
+    network = build_network(OWN_EXPERT, seed=52, dtype=dtype).eval()
+    runner = ChunkRunner(network)
+    batch = draw(network, Case(seed=7, batch=2))
+    moved = 0
+    for name, parameter in network.named_parameters():
+        before = fast(runner, batch)
+        parameter.data.add_(0.3)
+        after, fresh = fast(runner, batch), fast(ChunkRunner(copy.deepcopy(network)), batch)
+        assert torch.allclose(after, fresh, atol=1e-6), name
+        moved += not torch.equal(before, after)
+        parameter.data.sub_(0.3)
+    assert moved > 0.7 * len(list(network.parameters()))  # some feed nothing: the last layer of prefix and geometry
+
+
+def test_a_single_entry_acts_where_weights_are_not_copied() -> None:
+    network = build_network(SEGMENT, seed=53).eval()
+    runner, batch = ChunkRunner(network), draw(network, Case(seed=7, batch=2))
+    before = fast(runner, batch)
+    network.paligemma_with_expert.expert.layers[0].mlp.down_proj.weight.data[1, 2] += 5.0
+    after = fast(runner, batch)
+    assert not torch.equal(before, after)
+    assert torch.allclose(after, sample(network, batch, num_steps=3), atol=2e-6)
 
 
 @pytest.mark.parametrize("acting", [torch.no_grad, torch.inference_mode])

@@ -118,11 +118,12 @@ def _rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     return torch.addcmul(x * cos, torch.cat([second, first], dim=-1), sin)
 
 
-def _norm(x: Tensor, scale: Tensor | None, modulation: LayerModulation | None, which: int) -> Tensor:
+def _norm(x: Tensor, weight: Tensor | None, modulation: LayerModulation | None, which: int) -> Tensor:
     if modulation is not None:
         return adaptive_norm(x, modulation[which])
-    assert scale is not None
-    return (F.rms_norm(x.float(), (x.shape[-1],), None, RMS_EPS) * scale).to(x.dtype)
+    assert weight is not None
+    normed = F.rms_norm(x.float(), (x.shape[-1],), None, RMS_EPS)
+    return torch.addcmul(normed, normed, weight).to(x.dtype)  # normed * (1 + weight)
 
 
 def adaptive_norm(x: Tensor, modulation: Modulation) -> Tensor:

@@ -6,10 +6,11 @@
 
 Where a weight is stored in the compute dtype already, the network's own parameters become views of the large matrix: nothing
 is held twice, and what changes the one in place changes the other. Otherwise (bf16 compute over float32 storage) the large
-matrices are copies; `Weights.stale` tells when the network has moved on.
+matrices are copies, the only values that outlive a chunk; `Weights.stale` tells when the network has moved on.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from .gemma import GemmaLayer, GemmaModel, RMSNorm
 
+SAMPLE = 64  # entries of a copied weight that are compared before every chunk
 _DONE: Counter[str] = Counter()  # "steps" of any optimiser of this process
 
 
@@ -37,7 +39,7 @@ class NotPlainError(TypeError):
 
 @dataclass(frozen=True)
 class FusedLayer:
-    """One layer's matrices, (out, in) in the compute dtype, and the plain norms' scales, (W,) float32 or None."""
+    """One layer's matrices, (out, in) in the compute dtype, and the weights of its plain norms, (W,) float32 or None."""
 
     qkv: Tensor
     out: Tensor
@@ -60,14 +62,20 @@ def _fuse_layer(layer: nn.Module, dtype: torch.dtype) -> FusedLayer:
         out=_join([attention.o_proj], dtype),
         gate_up=_join([mlp.gate_proj, mlp.up_proj], dtype),
         down=_join([mlp.down_proj], dtype),
-        norm=norm_scale(layer.input_layernorm),
-        post_norm=norm_scale(layer.post_attention_layernorm),
+        norm=_norm_weight(layer.input_layernorm),
+        post_norm=_norm_weight(layer.post_attention_layernorm),
     )
 
 
-def norm_scale(norm: nn.Module) -> Tensor | None:
-    """1 + weight of a plain norm; None for an adaptive one, whose scale follows the flow time."""
-    return 1.0 + norm.weight.detach().float() if isinstance(norm, RMSNorm) else None
+def copied(model: GemmaModel, dtype: torch.dtype) -> list[Tensor]:
+    """The weights of which `fuse` makes copies."""
+    joined = (m.weight for m in model.layers.modules() if type(m) is nn.Linear)
+    return [weight.detach() for weight in joined if weight.dtype != dtype]
+
+
+def _norm_weight(norm: nn.Module) -> Tensor | None:
+    """Of a plain norm, in its own storage; None for an adaptive one, whose scale follows the flow time."""
+    return norm.weight.detach() if isinstance(norm, RMSNorm) else None
 
 
 def _join(linears: list[nn.Linear], dtype: torch.dtype) -> Tensor:
@@ -102,12 +110,13 @@ def _already_joined(weights: list[Tensor]) -> Tensor | None:
 
 
 class Weights:
-    """Remembers a network's modules and parameters, to notice when any was written to, replaced or moved.
+    """Remembers a network's modules, parameters and where they lie, and what the copied ones hold, to notice any change.
 
-    But not a write through `parameter.data`, of which torch keeps no account. Any optimiser's step counts as a write.
+    A write through `parameter.data` leaves no version behind, so of copied weights a sample of the values is compared, too:
+    it finds whatever changes a weight as a whole (an average of weights, say), not the single entry that it misses.
     """
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: nn.Module, copied: Sequence[Tensor] = ()) -> None:
         self._modules = list(
             network.modules()
         )  # held, or a module that comes later could have the address of one that went
@@ -115,17 +124,22 @@ class Weights:
             entries for module in self._modules for entries in (module._modules, module._parameters) if entries
         ]
         self._parameters = list(network.parameters())
+        self._copied = list(copied)
+        self._sampled = [weight.flatten()[:: (weight.numel() // SAMPLE) | 1] for weight in copied]
         self._seen = self._look()
+        if self._copied:
+            self._values = self._sample()
 
-    def _look(self) -> tuple[int, int, int, int]:
+    def _look(self) -> tuple[int, ...]:
         members = (id(member) for entries in self._members for member in entries.values())
-        return (
-            hash(tuple(members)),
-            hash(tuple((p.untyped_storage()._cdata, p.storage_offset()) for p in self._parameters)),
-            sum(parameter._version for parameter in self._parameters),
-            _DONE["steps"],
-        )
+        places = tuple((p.untyped_storage()._cdata, p.storage_offset()) for p in self._parameters)
+        writes = (sum(weight._version for weight in self._copied), _DONE["steps"]) if self._copied else ()
+        return (hash(tuple(members)), hash(places), *writes)
+
+    def _sample(self) -> Tensor:
+        """Bits of some entries of every copied weight (a NaN does not equal itself)."""
+        return torch.cat(self._sampled).view(torch.uint8)
 
     def stale(self) -> bool:
-        """Whether the network is another than it was."""
-        return self._look() != self._seen
+        """Whether the network is another than it was. On a GPU this waits for it, but only where weights are copied."""
+        return self._look() != self._seen or (bool(self._copied) and not torch.equal(self._values, self._sample()))

@@ -9,7 +9,8 @@
 A recorded graph reads and writes fixed addresses. So inputs have buffers of their own, what the graphs compute (the cache among
 it) stays where it was recorded, and nothing is allocated. Memory for what is only needed in passing is shared by all graphs,
 since no two run at once. Prompts are padded to a multiple of `PROMPT_STEP` tokens: up to 200 tokens make 7 shapes, which all
-fit into `CAPACITY`; the shape that was not used for longest makes room for a new one. When weights change, all are dropped.
+fit into `CAPACITY`; the shape that was not used for longest makes room for a new one. Weights are read
+where they lie, so new values act; when they lie elsewhere, or copies of them are out of date, all graphs are dropped.
 """
 
 from collections import OrderedDict

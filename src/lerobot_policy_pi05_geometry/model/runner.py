@@ -1,16 +1,18 @@
 """A whole action chunk, fast: the network's arithmetic without its modules. `PI05Pytorch.sample_actions` is the reference.
 
 ```
-   once per weights   fused matrices (fused.py); all modulations of all denoising steps, and of geometry's flow time 0
+   once per weights   fused matrices (fused.py)
    once per chunk     look: vision and text as in the plain path, then the prefix through its layers into the cache
                             (meanwhile geometry is measured: side_stream.py)
-                      act:  geometry through its layers into the cache; the suffix's masks, with the gate in them
+                      act:  geometry through its layers into the cache; the suffix's masks, with the gate in them;
+                            the modulations of all denoising steps
    once per step            the suffix through its layers: four matrix products, one attention, one cache write a layer
 ```
 
-What depends on the flow time alone is computed once and not at every step, what depends on the observation alone once per chunk
-and not in every layer. Nothing is approximated: in float32 the result is the plain path's to rounding. `look` and `act` compute
-tensors from tensors without looking at a value, so a GPU can record them and need not be waited for (graphs.py).
+What depends on the flow time alone is computed for all steps at once, what depends on the observation alone once per chunk and
+not in every layer. From chunk to chunk nothing is kept that was computed from weights (but for copies in another dtype), so
+nothing can be out of date. Nothing is approximated: in float32 the result is the plain path's to rounding. `look` and `act`
+compute tensors from tensors without looking at a value, so a GPU can record them and need not be waited for (graphs.py).
 
 Shapes: B batch, N tokens of a segment, W width, H heads, KV key/value heads, D head_dim, K keys up to the segment's end.
 """
@@ -21,13 +23,12 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.utils._pytree import tree_leaves
 
 from .attention import rotary_table
 from .cache import SegmentKVCache
 from .fast_layers import LayerModulation, Modulation, SegmentFrame, adaptive_norm, run_layers, write_attention_out
-from .fused import FusedLayer, Weights, fuse
-from .gemma import AdaRMSNorm, GemmaModel
+from .fused import FusedLayer, Weights, copied, fuse
+from .gemma import AdaRMSNorm
 from .layout import Segment, one_block, segment_mask, segment_positions
 from .pi05 import PI05Pytorch, SegmentTokens
 from .precision import compute_in
@@ -48,6 +49,13 @@ class Context(NamedTuple):
 
     prefix_pad: Tensor
     cache: SegmentKVCache
+
+
+class FlowTime(NamedTuple):
+    """What modulates an expert at one flow time: every layer, and the final norm."""
+
+    layers: Sequence[LayerModulation]
+    last: Modulation
 
 
 class Chunk(NamedTuple):
@@ -80,7 +88,7 @@ class ChunkRunner:
     @torch.inference_mode(False)  # or the joined weights could never again be trained
     @torch.no_grad()
     def _build(self) -> None:
-        """Everything that depends on the weights alone."""
+        """The weights as the runner wants them."""
         network, dtype = self.network.paligemma_with_expert, self.config.dtype
         self.device = self.network.action_in_proj.weight.device
         models = {segment: network.segment_model(segment) for segment in Segment}
@@ -90,35 +98,36 @@ class ChunkRunner:
                 fused[id(model)] = fuse(model, dtype)
         self._models = models
         self._layers = {segment: fused[id(model)] for segment, model in models.items()}
-        self._steps: dict[int, list[tuple[list[LayerModulation], Modulation]]] = {}
-        self._clean = self._modulations(models[Segment.GEOMETRY], 0.0)[0]
         self._side = SideStream(self.device)
-        self._weights = Weights(self.network)
+        distinct = {id(model): model for model in models.values()}.values()
+        self._weights = Weights(self.network, [weight for model in distinct for weight in copied(model, dtype)])
 
     def tensors(self) -> list[Tensor]:
         """All that is kept between chunks; some of it is the network's own storage (fused.py)."""
-        leaves = tree_leaves([self._clean, *self._steps.values()])
         matrices = (m for layers in self._layers.values() for layer in layers for m in vars(layer).values())
-        return [tensor for tensor in (*matrices, *leaves) if isinstance(tensor, Tensor)]
+        return [tensor for tensor in matrices if isinstance(tensor, Tensor)]
 
-    def _modulations(self, model: GemmaModel, time: float) -> tuple[list[LayerModulation], Modulation]:
-        """Of every layer of an expert and of its final norm, at one flow time."""
-        cond = self.network.embed_time(torch.tensor([time], dtype=torch.float32, device=self.device))
+    def _modulations(self, segment: Segment, times: Sequence[float]) -> list[FlowTime]:
+        """What modulates an expert at these T flow times."""
+        # Filled on the device: what is fetched from the host cannot be recorded.
+        flow_times = torch.cat([torch.full((1,), time, device=self.device) for time in times])
+        cond, model = self.network.embed_time(flow_times), self._models[segment]  # (T, W)
 
-        def at(norm: nn.Module | Tensor) -> Modulation:
+        def at_each(norm: nn.Module | Tensor) -> list[Modulation]:
             assert isinstance(norm, AdaRMSNorm)
-            scale, shift, gate = norm.dense(cond)[0].chunk(3)
-            return Modulation(1.0 + scale, shift, gate.to(self.config.dtype))
+            scale, shift, gate = norm.dense(cond).chunk(3, dim=-1)
+            rows = ((1.0 + scale).unbind(), shift.unbind(), gate.to(self.config.dtype).unbind())
+            return [Modulation(*row) for row in zip(*rows, strict=True)]
 
-        layers = [(at(layer.input_layernorm), at(layer.post_attention_layernorm)) for layer in model.layers]
-        return layers, at(model.norm)
+        layers = [
+            list(zip(at_each(layer.input_layernorm), at_each(layer.post_attention_layernorm), strict=True))
+            for layer in model.layers
+        ]
+        return [FlowTime(*row) for row in zip(zip(*layers, strict=True), at_each(model.norm), strict=True)]
 
-    def _schedule(self, num_steps: int) -> list[tuple[list[LayerModulation], Modulation]]:
-        """Modulations of the suffix at every denoising step; kept for each number of steps that was asked for."""
-        if num_steps not in self._steps:
-            times = [1.0 - step / num_steps for step in range(num_steps)]
-            self._steps[num_steps] = [self._modulations(self._models[Segment.SUFFIX], time) for time in times]
-        return self._steps[num_steps]
+    def _schedule(self, num_steps: int) -> list[FlowTime]:
+        """Of the suffix at every denoising step."""
+        return self._modulations(Segment.SUFFIX, [1.0 - step / num_steps for step in range(num_steps)])
 
     def __call__(self, *observation: Any, **kwargs: Any) -> Tensor:
         """An action chunk (B, S, D) float32 from the weights as they are now; arguments as in `sample`."""
@@ -202,7 +211,8 @@ class ChunkRunner:
         segment = self.network.embed_geometry(*geometry)
         assert segment.embs is not None
         frame = self._frame([context.prefix_pad, segment.pad, None], Segment.GEOMETRY)
-        self._run(Segment.GEOMETRY, segment.embs, frame, context.cache, self._clean, output=False)
+        clean = self._modulations(Segment.GEOMETRY, [0.0])[0].layers
+        self._run(Segment.GEOMETRY, segment.embs, frame, context.cache, clean, output=False)
         return segment.pad
 
     def denoise(self, context: Context, x_t: Tensor, geometry_pad: Tensor | None, num_steps: int) -> Tensor:
@@ -221,7 +231,7 @@ class ChunkRunner:
         embs: Tensor,
         frame: SegmentFrame,
         cache: SegmentKVCache,
-        modulations: list[LayerModulation] | None,
+        modulations: Sequence[LayerModulation] | None,
         output: bool,
     ) -> Tensor:
         """Embeddings (B, N, W) of a segment through its layers, in the compute dtype."""

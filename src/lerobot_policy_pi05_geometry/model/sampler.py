@@ -103,8 +103,10 @@ class ChunkSampler:
         return {
             "runner": "active",
             "matrices": "joined (q, k, v; gate, up), "
-            + ("in the network's own storage" if shared else "copies in the compute dtype"),
-            "flow time": "modulations of every denoising step computed once, until weights change",
+            + (
+                "in the network's own storage" if shared else "copies in the compute dtype, compared before every chunk"
+            ),
+            "flow time": "modulations of all denoising steps computed at once, in every chunk",
             "attention": "written-out products (measured: faster on a CPU in bf16)" if written_out else "SDPA",
             "last VLM layer": "stops at keys and values",
             "cameras": "one vision batch, absent ones not encoded",

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..model.cache import SegmentKVCache
 from ..model.pi05 import PI05Pytorch
-from ..model.runner import ChunkRunner, Context, Observation
+from ..model.runner import ChunkRunner, Context, FlowTime, Observation
 from ..model.sampler import ChunkSampler
 from ..model.side_stream import GeometryTokens, SideStream
 from .counting import MemoryCounter
@@ -41,12 +41,14 @@ class CountedRunner(ChunkRunner):
     def _build(self) -> None:
         with self._counter.naming("weights"):
             super()._build()
-            self._schedule(self.config.num_inference_steps)  # of the chunk before
         if self._graphs:
             self._side = CountedSide(self._counter)
 
-    def _schedule(self, num_steps: int) -> list[Any]:
-        return super()._schedule(self.config.num_inference_steps)[:num_steps]  # all are kept, however few are run here
+    def refresh(self) -> None:
+        """Nothing: there are no values to compare, and no weight changes while one chunk is planned."""
+
+    def _schedule(self, num_steps: int) -> list[FlowTime]:
+        return super()._schedule(self.config.num_inference_steps)[:num_steps]  # all are there, however few are run here
 
     def look(self, observation: Observation, geometry: GeometryTokens | None, room: tuple[int, int]) -> Context:
         """Geometry that was measured before has used memory that is not the graph's: the two add up in this order, too."""
