@@ -206,8 +206,8 @@ def test_matrices_that_the_runner_keeps_are_weights():
 def test_the_runners_modulations_of_every_denoising_step_are_there():
     few, many = (fake(num_inference_steps=steps).inference(load(1)) for steps in (400, 2000))
     expert = make_config().network().expert
-    # Two norms a layer and the last; 1 + scale, and the three that a norm's linear map gives at once; float32.
-    modulations = 1600 * (2 * expert.depth + 1) * (1 + 3) * expert.width * 4
+    # Two norms a layer and the last; the three that a norm's linear map gives at once, and them stacked; float32.
+    modulations = 1600 * (2 * expert.depth + 1) * (3 + 3) * expert.width * 4
     assert many.total - few.total == pytest.approx(modulations, rel=0.05)  # the embedded flow times beside
     assert many.weights == few.weights
 

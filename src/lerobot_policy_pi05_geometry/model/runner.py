@@ -22,13 +22,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from .attention import rotary_table
 from .cache import SegmentKVCache
 from .fast_layers import LayerModulation, Modulation, SegmentFrame, adaptive_norm, run_layers, write_attention_out
 from .fused import FusedLayer, Weights, copied, fuse
-from .gemma import AdaRMSNorm
 from .layout import Segment, one_block, segment_mask, segment_positions
 from .pi05 import PI05Pytorch, SegmentTokens
 from .precision import compute_in
@@ -112,18 +111,14 @@ class ChunkRunner:
         # Filled on the device: what is fetched from the host cannot be recorded.
         flow_times = torch.cat([torch.full((1,), time, device=self.device) for time in times])
         cond, model = self.network.embed_time(flow_times), self._models[segment]  # (T, W)
-
-        def at_each(norm: nn.Module | Tensor) -> list[Modulation]:
-            assert isinstance(norm, AdaRMSNorm)
-            scale, shift, gate = norm.dense(cond).chunk(3, dim=-1)
-            rows = ((1.0 + scale).unbind(), shift.unbind(), gate.to(self.config.dtype).unbind())
-            return [Modulation(*row) for row in zip(*rows, strict=True)]
-
-        layers = [
-            list(zip(at_each(layer.input_layernorm), at_each(layer.post_attention_layernorm), strict=True))
-            for layer in model.layers
-        ]
-        return [FlowTime(*row) for row in zip(zip(*layers, strict=True), at_each(model.norm), strict=True)]
+        norms = [norm for x in model.layers for norm in (x.input_layernorm, x.post_attention_layernorm)]
+        given = torch.stack([norm.dense(cond) for norm in (*norms, model.norm)], dim=1)  # (T, norms, 3 W)
+        scale, shift, gate = given.chunk(3, dim=-1)
+        found = []
+        for rows in zip(1.0 + scale, shift, gate.to(self.config.dtype), strict=True):
+            *each, last = (Modulation(*row) for row in zip(*rows, strict=True))
+            found.append(FlowTime(list(zip(each[::2], each[1::2], strict=True)), last))
+        return found
 
     def _schedule(self, num_steps: int) -> list[FlowTime]:
         """Of the suffix at every denoising step."""
