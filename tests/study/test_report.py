@@ -48,6 +48,15 @@ def test_overlap_and_its_absence_are_said():
     assert "the intervals overlap" in said(5, 4)
 
 
+def test_the_lead_is_over_tasks_and_knows_training_seeds():
+    rows = table({("a", "geometry"): 9, ("a", "rgb"): 1, ("b", "geometry"): 6, ("b", "rgb"): 4, ("c", "geometry"): 0})
+    assert "Were training seeds drawn anew, the lead of +50 points would be +" in answer(rows)
+    lucky = rows[rows["training_seed"] == 0]
+    assert "drawn anew" not in answer(lucky)
+    lost = rows[rows["training_seed"] == 1].assign(success=False)  # one seed in which nobody succeeds
+    assert "the lead of +25 points would be +0 to" in answer(pd.concat([lucky, lost]))
+
+
 def test_without_the_camera_moved_the_best_cell_is_named():
     found = answer(table({("t", "geometry"): 3, ("t", "rgb"): 7}, condition="inside"))
     assert "The best cell of this study is rgb under 'inside': 70%" in found

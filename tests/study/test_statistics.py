@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_policy_pi05_geometry.study.statistics import compare, holm, wilson
+from lerobot_policy_pi05_geometry.study.statistics import bootstrap, compare, holm, wilson
 
 tables = st.integers(0, 2**32 - 1).map(np.random.default_rng)
 
@@ -46,6 +46,14 @@ def test_the_interval_of_a_difference_knows_that_training_seeds_differ():
     assert one.difference == other.difference
     assert other.high - other.low > 3 * (one.high - one.low)
     assert other.low == 0.0  # a seed without the effect may be all there is
+
+
+def test_seeds_of_different_tasks_are_resampled_apart():
+    """Two tasks whose seeds differ alike say more together than each alone; the same one twice in step would not."""
+    values = np.repeat(np.array([[0.0], [1.0]]), 40, axis=1)
+    (mean, low, high), (_, alone_low, alone_high) = bootstrap(*[values] * 8), bootstrap(values)
+    assert mean == 0.5
+    assert high - low < 0.75 * (alone_high - alone_low)
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=8))

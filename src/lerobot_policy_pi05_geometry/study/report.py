@@ -14,7 +14,7 @@ from ..inspect.pictures import curves_figure, depth_figure, layout_figure, segme
 from ..loading import load_policy
 from .arms import ARMS
 from .conditions import CONDITIONS
-from .results import Cell, Versus, cells, comparisons, episodes_table
+from .results import Cell, Versus, cells, comparisons, episodes_table, lead
 from .simulated import SimulatedRun
 from .training_log import read_curve
 
@@ -41,10 +41,10 @@ def write_report(folder: Path, runs: Sequence[SimulatedRun], command: str) -> Pa
     page.heading("What this cannot say")
     page.text(
         "The networks are small and trained from scratch, depth is simulated, the experts are scripted and the tasks are "
-        "few: how much a pretrained π0.5 gains on a real robot is not measured here. Wilson intervals treat all episodes of "
-        "an arm alike; the intervals of differences resample training seeds too, of which there are "
-        f"{len({run.seed for run in runs})}. A difference whose corrected p is above 0.05 is no difference that this study "
-        "can show."
+        "few: how much a pretrained π0.5 gains on a real robot is not measured here. Wilson intervals and McNemar's test treat "
+        "all episodes of an arm alike, and so know nothing of how much training seeds differ; the intervals of differences "
+        f"resample them, but there are only {len({run.seed for run in runs})}. A difference whose corrected p is above 0.05 is "
+        "no difference that this study can show."
     )
     page.heading("Again, or on your own")
     page.code(command)
@@ -54,7 +54,7 @@ def write_report(folder: Path, runs: Sequence[SimulatedRun], command: str) -> Pa
 
 
 def answer(table: pd.DataFrame) -> str:
-    """What came out, in one sentence, whatever it is: geometry against RGB only with the camera moved."""
+    """What came out, whatever it is: geometry against RGB only with the camera moved, and how sure that is."""
     rows = table[table["condition"] == "outside"]
     arms = {cell.arm: cell for cell in cells(rows.assign(task="all"))}
     if "geometry" not in arms or "rgb" not in arms:
@@ -67,6 +67,12 @@ def answer(table: pd.DataFrame) -> str:
         "With the camera outside the range it was trained on, the policy with geometry succeeds in "
         f"{_cell(geometry)} of episodes and RGB only in {_cell(rgb)}: {verdict}."
     )
+    of_both = [task for task, of_task in rows.groupby("task") if set(_RIVALS) <= set(of_task["arm"])]
+    if of_both and rows["training_seed"].nunique() > 1:
+        difference, low, high = (100 * points for points in lead(rows[rows["task"].isin(of_both)], *_RIVALS))
+        text += (
+            f" Were training seeds drawn anew, the lead of {difference:+.0f} points would be {low:+.0f} to {high:+.0f}."
+        )
     controls = [_control(name, rows, arm) for arm, name in _NAMES.items() if arm in arms]
     return text + (f" For comparison: {', '.join(controls)}." if controls else "")
 
@@ -85,6 +91,7 @@ def _rate(rows: pd.DataFrame, arm: str) -> float:
     return float(rows.loc[rows["arm"] == arm, "success"].mean())
 
 
+_RIVALS = ("geometry", "rgb")
 _NAMES = {"rgb-wide": "RGB trained on the wide camera range", "random": "random tokens", "blind": "no camera at all"}
 
 
@@ -114,13 +121,18 @@ def _task(
     by_place = {(cell.arm, cell.condition): cell for cell in found}
     bars = {arm: [_bar(by_place.get((arm, condition))) for condition in conditions] for arm in arms}
     titles = [CONDITIONS[condition].title for condition in conditions]
-    caption = "Success per arm and condition, over all training seeds."
+    caption = "Success per arm and condition, over all training seeds; in the table, that of each of them in brackets."
     page.row(picture(success_figure(titles, bars), caption, pictures / f"success_{task}.png"))
     parameters = {run.arm_name: _parameters(run) for run in _finished(runs) if run.task == task}
     page.table(
         ["arm", "what it is", "parameters", *titles],
         [
-            [arm, ARMS[arm].title, parameters.get(arm, "crashed"), *(_cell(by_place.get((arm, c))) for c in conditions)]
+            [
+                arm,
+                ARMS[arm].title,
+                parameters.get(arm, "crashed"),
+                *(_seeds(by_place.get((arm, c))) for c in conditions),
+            ]
             for arm in arms
         ],
     )
@@ -191,6 +203,13 @@ def _cell(cell: Cell | None) -> str:
     low, high = cell.interval()
     crashed = f", {cell.crashed_runs} crashed" if cell.crashed_runs else ""
     return f"{cell.rate:.0%} ({low:.0%} to {high:.0%}{crashed})"
+
+
+def _seeds(cell: Cell | None) -> str:
+    """A cell, and the rate of every training seed where there are several."""
+    if cell is None or len(cell.by_seed) == 1:
+        return _cell(cell)
+    return f"{_cell(cell)} [{', '.join(f'{100 * rate:.0f}' for rate in cell.by_seed)}]"
 
 
 def _difference(versus: Versus | None) -> str:

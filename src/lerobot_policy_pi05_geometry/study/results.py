@@ -13,7 +13,7 @@ import pandas as pd
 from .arms import ARMS
 from .conditions import CONDITIONS
 from .simulated import SimulatedRun
-from .statistics import Difference, compare, holm, wilson
+from .statistics import Difference, bootstrap, compare, holm, wilson
 
 
 def episodes_table(runs: Sequence[SimulatedRun]) -> pd.DataFrame:
@@ -45,7 +45,7 @@ def episodes_table(runs: Sequence[SimulatedRun]) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Cell:
-    """Success of an arm on a task under a condition, over all training seeds."""
+    """Success of an arm on a task under a condition, over all training seeds; by_seed: the rate of each of them."""
 
     task: str
     arm: str
@@ -53,6 +53,7 @@ class Cell:
     successes: int
     episodes: int
     crashed_runs: int
+    by_seed: tuple[float, ...]
 
     @property
     def rate(self) -> float:
@@ -68,7 +69,8 @@ def cells(table: pd.DataFrame) -> list[Cell]:
     found = []
     for (task, arm, condition), rows in table.groupby(["task", "arm", "condition"], sort=False):
         crashed = rows.loc[rows["crashed"], "training_seed"].nunique()
-        found.append(Cell(task, arm, condition, int(rows["success"].sum()), len(rows), crashed))
+        by_seed = tuple(rows.groupby("training_seed")["success"].mean())
+        found.append(Cell(task, arm, condition, int(rows["success"].sum()), len(rows), crashed, by_seed))
     order = {name: i for i, name in enumerate([*ARMS, *CONDITIONS])}
     return sorted(found, key=lambda cell: (cell.task, order[cell.arm], order[cell.condition]))
 
@@ -89,7 +91,7 @@ def comparisons(table: pd.DataFrame, reference: str = "geometry") -> list[Versus
     """Every arm against the reference arm, on the same seeds, per task and condition."""
     found: list[tuple[str, str, str, Difference]] = []
     for (task, condition), rows in table.groupby(["task", "condition"], sort=False):
-        grids = {arm: _grid(of_arm) for arm, of_arm in rows.groupby("arm", sort=False)}
+        grids = {arm: grid(of_arm) for arm, of_arm in rows.groupby("arm", sort=False)}
         if reference in grids:
             found += [
                 (task, condition, arm, compare(grids[reference], grid))
@@ -103,6 +105,12 @@ def comparisons(table: pd.DataFrame, reference: str = "geometry") -> list[Versus
     ]
 
 
-def _grid(rows: pd.DataFrame) -> np.ndarray:
+def lead(rows: pd.DataFrame, arm: str, over: str) -> tuple[float, float, float]:
+    """Success of one arm minus another's, mean over the tasks that `rows` of one condition are of, with a bootstrap interval."""
+    grids = [[grid(of_task[of_task["arm"] == name]) for name in (arm, over)] for _, of_task in rows.groupby("task")]
+    return bootstrap(*(first.astype(float) - second.astype(float) for first, second in grids))
+
+
+def grid(rows: pd.DataFrame) -> np.ndarray:
     """Success by (training seed, episode seed), bool."""
     return rows.pivot(index="training_seed", columns="episode_seed", values="success").to_numpy(dtype=bool)

@@ -41,17 +41,21 @@ def compare(first: np.ndarray, second: np.ndarray) -> Difference:
     return Difference(*bootstrap(first.astype(float) - second.astype(float)), p)
 
 
-def bootstrap(values: np.ndarray) -> tuple[float, float, float]:
+def bootstrap(*tables: np.ndarray) -> tuple[float, float, float]:
     """Mean of (training seeds, episodes) values, with its 95 % interval: seeds are resampled, then episodes within them.
 
-    The resampling itself is always the same, so that a report repeats exactly.
+    Of several tables, one per task, the mean of their means. The resampling itself is always the same, so that a report
+    repeats exactly.
     """
     random = np.random.default_rng(0)
-    seeds, episodes = values.shape
-    rows = random.integers(seeds, size=(_RESAMPLES, seeds, 1))
-    columns = random.integers(episodes, size=(_RESAMPLES, seeds, episodes))
-    low, high = np.quantile(values[rows, columns].mean(axis=(1, 2)), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
-    return float(values.mean()), float(low), float(high)
+    means = []
+    for values in tables:
+        seeds, episodes = values.shape
+        rows = random.integers(seeds, size=(_RESAMPLES, seeds, 1))
+        columns = random.integers(episodes, size=(_RESAMPLES, seeds, episodes))
+        means.append(values[rows, columns].mean(axis=(1, 2)))
+    low, high = np.quantile(np.mean(means, axis=0), [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(np.mean([values.mean() for values in tables])), float(low), float(high)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
