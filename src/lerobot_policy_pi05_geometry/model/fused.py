@@ -20,7 +20,6 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from .gemma import GemmaLayer, GemmaModel, RMSNorm
 
-SAMPLE = 64  # entries of a copied weight that are compared before every chunk
 _DONE: Counter[str] = Counter()  # "steps" of any optimiser of this process
 
 
@@ -112,8 +111,8 @@ def _already_joined(weights: list[Tensor]) -> Tensor | None:
 class Weights:
     """Remembers a network's modules, parameters and where they lie, and what the copied ones hold, to notice any change.
 
-    A write through `parameter.data` leaves no version behind, so of copied weights a sample of the values is compared, too:
-    it finds whatever changes a weight as a whole (an average of weights, say), not the single entry that it misses.
+    A write through `parameter.data` leaves no version behind, so of copied weights the diagonals are compared, too: they show
+    whatever changes a weight as a whole (an average of weights, say), and not every change of a single entry.
     """
 
     def __init__(self, network: nn.Module, copied: Sequence[Tensor] = ()) -> None:
@@ -125,7 +124,6 @@ class Weights:
         ]
         self._parameters = list(network.parameters())
         self._copied = list(copied)
-        self._sampled = [weight.flatten()[:: (weight.numel() // SAMPLE) | 1] for weight in copied]
         self._seen = self._look()
         if self._copied:
             self._values = self._sample()
@@ -137,8 +135,8 @@ class Weights:
         return (hash(tuple(members)), hash(places), *writes)
 
     def _sample(self) -> Tensor:
-        """Bits of some entries of every copied weight (a NaN does not equal itself)."""
-        return torch.cat(self._sampled).view(torch.uint8)
+        """The diagonals of the copied weights, as bits (a NaN does not equal itself)."""
+        return torch.cat([weight.diagonal() for weight in self._copied]).view(torch.uint8)
 
     def stale(self) -> bool:
         """Whether the network is another than it was. On a GPU this waits for it, but only where weights are copied."""
