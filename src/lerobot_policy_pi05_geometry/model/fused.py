@@ -6,7 +6,7 @@
 
 Where a weight is stored in the compute dtype already, the network's own parameters become views of the large matrix: nothing
 is held twice, and what changes the one in place changes the other. Otherwise (bf16 compute over float32 storage) the large
-matrices are copies, the only values that outlive a chunk; `Weights.stale` tells when the network has moved on.
+matrices are copies; `Weights.stale` tells when the network has moved on.
 """
 
 from collections import Counter
@@ -109,13 +109,13 @@ def _already_joined(weights: list[Tensor]) -> Tensor | None:
 
 
 class Weights:
-    """Remembers a network's modules, parameters and where they lie, and what the copied ones hold, to notice any change.
+    """Remembers a network's modules, parameters and where they lie, and what those hold from which something was computed.
 
-    A write through `parameter.data` leaves no version behind, so of copied weights the diagonals are compared, too: they show
-    whatever changes a weight as a whole (an average of weights, say), and not every change of a single entry.
+    read: these last. A write through `parameter.data` leaves no version behind, so vectors and the diagonals of matrices are
+    compared, too: they show whatever changes a weight as a whole (an average of weights, say), not every single entry.
     """
 
-    def __init__(self, network: nn.Module, copied: Sequence[Tensor] = ()) -> None:
+    def __init__(self, network: nn.Module, read: Sequence[Tensor] = ()) -> None:
         self._modules = list(
             network.modules()
         )  # held, or a module that comes later could have the address of one that went
@@ -123,21 +123,21 @@ class Weights:
             entries for module in self._modules for entries in (module._modules, module._parameters) if entries
         ]
         self._parameters = list(network.parameters())
-        self._copied = list(copied)
+        self._read = list(read)
         self._seen = self._look()
-        if self._copied:
+        if self._read:
             self._values = self._sample()
 
     def _look(self) -> tuple[int, ...]:
         members = (id(member) for entries in self._members for member in entries.values())
         places = tuple((p.untyped_storage()._cdata, p.storage_offset()) for p in self._parameters)
-        writes = (sum(weight._version for weight in self._copied), _DONE["steps"]) if self._copied else ()
+        writes = (sum(weight._version for weight in self._read), _DONE["steps"]) if self._read else ()
         return (hash(tuple(members)), hash(places), *writes)
 
     def _sample(self) -> Tensor:
-        """The diagonals of the copied weights, as bits (a NaN does not equal itself)."""
-        return torch.cat([weight.diagonal() for weight in self._copied]).view(torch.uint8)
+        """Some of the values, as bits (a NaN does not equal itself)."""
+        return torch.cat([weight.diagonal() if weight.ndim == 2 else weight for weight in self._read]).view(torch.uint8)
 
     def stale(self) -> bool:
-        """Whether the network is another than it was. On a GPU this waits for it, but only where weights are copied."""
-        return self._look() != self._seen or (bool(self._copied) and not torch.equal(self._values, self._sample()))
+        """Whether the network is another than it was. On a GPU this waits for it if there is anything to compare."""
+        return self._look() != self._seen or (bool(self._read) and not torch.equal(self._values, self._sample()))

@@ -4,15 +4,14 @@
    once per weights   fused matrices (fused.py)
    once per chunk     look: vision and text as in the plain path, then the prefix through its layers into the cache
                             (meanwhile geometry is measured: side_stream.py)
-                      act:  geometry through its layers into the cache; the suffix's masks, with the gate in them;
-                            the modulations of all denoising steps
+                      act:  geometry through its layers into the cache; the suffix's masks, with the gate in them
    once per step            the suffix through its layers: four matrix products, one attention, one cache write a layer
 ```
 
-What depends on the flow time alone is computed for all steps at once, what depends on the observation alone once per chunk and
-not in every layer. From chunk to chunk nothing is kept that was computed from weights (but for copies in another dtype), so
-nothing can be out of date. Nothing is approximated: in float32 the result is the plain path's to rounding. `look` and `act`
-compute tensors from tensors without looking at a value, so a GPU can record them and need not be waited for (graphs.py).
+What depends on the flow time alone, the modulations of all norms, is computed for all steps at once; on a CPU it is kept until
+weights change, on a GPU it is part of `act`, since to see whether they changed is to wait. What depends on the observation alone
+is computed once per chunk and not in every layer. Nothing is approximated: in float32 the result is the plain path's to rounding.
+`look` and `act` compute tensors from tensors without looking at a value, so a GPU can record them and need not be waited for.
 
 Shapes: B batch, N tokens of a segment, W width, H heads, KV key/value heads, D head_dim, K keys up to the segment's end.
 """
@@ -23,6 +22,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from .attention import rotary_table
 from .cache import SegmentKVCache
@@ -30,7 +30,7 @@ from .fast_layers import LayerModulation, Modulation, SegmentFrame, adaptive_nor
 from .fused import FusedLayer, Weights, copied, fuse
 from .layout import Segment, one_block, segment_mask, segment_positions
 from .pi05 import PI05Pytorch, SegmentTokens
-from .precision import compute_in
+from .precision import Float32Linear, compute_in
 from .side_stream import GeometryTokens, PendingGeometry, SideStream
 
 
@@ -98,13 +98,18 @@ class ChunkRunner:
         self._models = models
         self._layers = {segment: fused[id(model)] for segment, model in models.items()}
         self._side = SideStream(self.device)
+        self._kept: dict[tuple[Segment, int], list[FlowTime]] = {}
         distinct = {id(model): model for model in models.values()}.values()
-        self._weights = Weights(self.network, [weight for model in distinct for weight in copied(model, dtype)])
+        read = [weight for model in distinct for weight in copied(model, dtype)]
+        if self._may_look:  # what modulations are kept of: the norms' linear maps and the flow time's
+            linears = [module for module in self.network.modules() if isinstance(module, Float32Linear)]
+            read += [parameter.detach() for linear in linears for parameter in linear.parameters()]
+        self._weights = Weights(self.network, read)
 
     def tensors(self) -> list[Tensor]:
         """All that is kept between chunks; some of it is the network's own storage (fused.py)."""
         matrices = (m for layers in self._layers.values() for layer in layers for m in vars(layer).values())
-        return [tensor for tensor in matrices if isinstance(tensor, Tensor)]
+        return [tensor for tensor in (*matrices, *tree_leaves(list(self._kept.values()))) if isinstance(tensor, Tensor)]
 
     def _modulations(self, segment: Segment, times: Sequence[float]) -> list[FlowTime]:
         """What modulates an expert at these T flow times."""
@@ -120,9 +125,16 @@ class ChunkRunner:
             found.append(FlowTime(list(zip(each[::2], each[1::2], strict=True)), last))
         return found
 
-    def _schedule(self, num_steps: int) -> list[FlowTime]:
-        """Of the suffix at every denoising step."""
-        return self._modulations(Segment.SUFFIX, [1.0 - step / num_steps for step in range(num_steps)])
+    def _schedule(self, segment: Segment, num_steps: int) -> list[FlowTime]:
+        """Of the suffix at every denoising step; of geometry at the clean end of the flow."""
+        key = segment, num_steps
+        if key in self._kept:
+            return self._kept[key]
+        times = [1.0 - step / num_steps for step in range(num_steps)] if segment is Segment.SUFFIX else [0.0]
+        schedule = self._modulations(segment, times)
+        if self._may_look:
+            self._kept[key] = schedule
+        return schedule
 
     def __call__(self, *observation: Any, **kwargs: Any) -> Tensor:
         """An action chunk (B, S, D) float32 from the weights as they are now; arguments as in `sample`."""
@@ -206,7 +218,7 @@ class ChunkRunner:
         segment = self.network.embed_geometry(*geometry)
         assert segment.embs is not None
         frame = self._frame([context.prefix_pad, segment.pad, None], Segment.GEOMETRY)
-        clean = self._modulations(Segment.GEOMETRY, [0.0])[0].layers
+        clean = self._schedule(Segment.GEOMETRY, 1)[0].layers
         self._run(Segment.GEOMETRY, segment.embs, frame, context.cache, clean, output=False)
         return segment.pad
 
@@ -215,7 +227,7 @@ class ChunkRunner:
         network, dt = self.network, -1.0 / num_steps
         suffix_pad = torch.ones(x_t.shape[:2], dtype=torch.bool, device=x_t.device)
         frame = self._frame([context.prefix_pad, geometry_pad, suffix_pad], Segment.SUFFIX)
-        for layers, last in self._schedule(num_steps):
+        for layers, last in self._schedule(Segment.SUFFIX, num_steps):
             x = self._run(Segment.SUFFIX, network.action_in_proj(x_t), frame, context.cache, layers, output=True)
             x_t = torch.add(x_t, network.action_out_proj(adaptive_norm(x, last)), alpha=dt)
         return x_t

@@ -106,7 +106,8 @@ class ChunkSampler:
             + (
                 "in the network's own storage" if shared else "copies in the compute dtype, compared before every chunk"
             ),
-            "flow time": "modulations of all denoising steps computed at once, in every chunk",
+            "flow time": "modulations of all denoising steps computed at once, "
+            + ("until weights change" if self._device.type == "cpu" else "in every chunk"),
             "attention": "written-out products (measured: faster on a CPU in bf16)" if written_out else "SDPA",
             "last VLM layer": "stops at keys and values",
             "cameras": "one vision batch, absent ones not encoded",

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..model.cache import SegmentKVCache
+from ..model.layout import Segment
 from ..model.pi05 import PI05Pytorch
 from ..model.runner import ChunkRunner, Context, FlowTime, Observation
 from ..model.sampler import ChunkSampler
@@ -47,8 +48,9 @@ class CountedRunner(ChunkRunner):
     def refresh(self) -> None:
         """Nothing: there are no values to compare, and no weight changes while one chunk is planned."""
 
-    def _schedule(self, num_steps: int) -> list[FlowTime]:
-        return super()._schedule(self.config.num_inference_steps)[:num_steps]  # all are there, however few are run here
+    def _schedule(self, segment: Segment, num_steps: int) -> list[FlowTime]:
+        """All that there will be, however few steps are run here."""
+        return super()._schedule(segment, self.config.num_inference_steps)[:num_steps]
 
     def look(self, observation: Observation, geometry: GeometryTokens | None, room: tuple[int, int]) -> Context:
         """Geometry that was measured before has used memory that is not the graph's: the two add up in this order, too."""
