@@ -11,7 +11,8 @@ with an arm without them beside it), with geometry features given: what measures
 also measure: Depth Anything 3 with random weights on the same cameras, beside vision and prefix, and before them. Ours pads the
 prompt (`--prompt` tokens) to what it needs, on a GPU to the next multiple of 32; LeRobot's always to 200. The floor is what this
 machine's own matrix products and memory would need for our network's products alone, measured in the same run. `far` is the
-distance of the runner's actions from the plain path's, over the size of those.
+distance of the runner's actions from the plain path's, over the size of those. Memory is the peak of live tensors in the first
+chunk, weights, what is built and recorded for it included; on a CPU not of the compiled arms, which cannot be watched.
 """
 
 import argparse
@@ -26,6 +27,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from benchmarks.memory import peak_memory
 from benchmarks.network import build, fill, inputs
 from benchmarks.network import parts as lerobot_parts
 from lerobot_policy_pi05_geometry.geometry import GeometryEncoder
@@ -234,11 +236,27 @@ def floor(args: argparse.Namespace, cameras: int, ours: PI05Pytorch) -> dict[str
     }
 
 
+def first_chunks(
+    args: argparse.Namespace, functions: dict[str, Callable[[], Tensor]], ours: PI05Pytorch, lerobot
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Seconds of every arm's first chunk, which is compiled or recorded, if so; and the most memory it takes, in MiB."""
+    first, memory = {}, {}
+    for arm, function in functions.items():
+        if args.device == "cpu" and arm in (COMPILED, OWN_COMPILED):
+            first[arm] = seconds(function, args.device)
+            continue
+        network = lerobot if arm in (EAGER, COMPILED) else ours
+        start = time.perf_counter()
+        memory[arm] = peak_memory(network, function)
+        first[arm] = time.perf_counter() - start
+    return first, memory
+
+
 def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) -> dict:
     """Times of all arms with this many cameras."""
     functions = chunk_functions(args, cameras, ours, lerobot)
     times: dict[str, list[float]] = {arm: [] for arm in functions}
-    first = {arm: seconds(function, args.device) for arm, function in functions.items()}  # compiled or recorded, if so
+    first, memory = first_chunks(args, functions, ours, lerobot)
     for round_index in range(args.rounds + args.warmup):
         for arm, function in functions.items():
             value = seconds(function, args.device)
@@ -254,6 +272,8 @@ def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) 
             "ratio": statistics.median(ratios),
             "first_s": first[arm],
         }
+        if arm in memory:
+            result[arm] |= {"peak_MiB": memory[arm], "memory_ratio": memory[arm] / memory[EAGER]}
     if args.trace:
         trace(args, cameras, functions)
     parts, step = split(args, cameras, ours, lerobot)
@@ -319,7 +339,8 @@ def main() -> None:
         print(f"{cameras} camera(s)")
         for arm, row in found["arms"].items():
             shown = f"p50 {row['p50_ms']:9.1f} ms   p95 {row['p95_ms']:9.1f} ms   first {row['first_s']:6.1f} s"
-            print(f"  {arm:20} {shown}   ratio {row['ratio']:.2f}")
+            peak = f"   peak {row['peak_MiB']:.0f} MiB   ratio {row['memory_ratio']:.2f}" if "peak_MiB" in row else ""
+            print(f"  {arm:20} {shown}   ratio {row['ratio']:.2f}{peak}")
         for name in ("geometry over no geometry", "step over LeRobot's", *PAIRS, "chunk over floor", "far"):
             if name in found:
                 print(f"  {name} {found[name]:.3g}")

@@ -16,18 +16,16 @@ import argparse
 import json
 import statistics
 import time
-import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor, nn
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_iter
 
 from benchmarks.lerobot_pi05 import build_lerobot_pi05, copy_weights
+from benchmarks.memory import peak_memory
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, NetworkConfig, PI05Pytorch
 from lerobot_policy_pi05_geometry.model.variants import (
@@ -49,50 +47,6 @@ PALIGEMMA_VARIANTS["mid"] = PaliGemmaVariant(
     vocab_size=1024,
 )
 EXPERT_VARIANTS["mid"] = GemmaVariant(width=384, depth=6, mlp_dim=1536, num_heads=8, num_kv_heads=1, head_dim=96)
-
-
-class _LiveTensors(TorchDispatchMode):
-    """Counts bytes of storages from their first use in here until they are freed."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.bytes = self.peak = 0
-        self.known: set[int] = set()
-
-    def add(self, tensor: Tensor) -> None:
-        storage = tensor.untyped_storage()
-        key, size = storage._cdata, storage.nbytes()
-        if key not in self.known:
-            self.known.add(key)
-            self.bytes += size
-            self.peak = max(self.peak, self.bytes)
-            weakref.finalize(storage, self.remove, key, size)
-
-    def remove(self, key: int, size: int) -> None:
-        self.known.discard(key)
-        self.bytes -= size
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
-        for value in tree_iter(result):
-            if isinstance(value, Tensor):
-                self.add(value)
-        return result
-
-
-def peak_memory(module: nn.Module, step: Callable[[], None], held: Sequence[Tensor] = ()) -> float:
-    """MiB of live tensors at the peak of a step that starts without gradients; `held` is there beside the module's."""
-    module.zero_grad()
-    device = next(module.parameters()).device
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats()
-        step()
-        return torch.cuda.max_memory_allocated() / 2**20
-    with _LiveTensors() as live:
-        for tensor in (*module.parameters(), *module.buffers(), *held):
-            live.add(tensor)
-        step()
-    return live.peak / 2**20
 
 
 # --- against LeRobot --------------------------------------------------------------------------------------------------

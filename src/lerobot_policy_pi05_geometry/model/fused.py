@@ -27,9 +27,8 @@ def _count_step(*_: Any) -> None:
     _DONE["steps"] += 1
 
 
-register_optimizer_step_post_hook(
-    _count_step
-)  # torch's fused optimisers leave the versions of what they write as they were
+# torch's fused optimisers leave the versions of what they write as they were
+register_optimizer_step_post_hook(_count_step)
 
 
 class NotPlainError(TypeError):
@@ -116,9 +115,8 @@ class Weights:
     """
 
     def __init__(self, network: nn.Module, read: Sequence[Tensor] = ()) -> None:
-        self._modules = list(
-            network.modules()
-        )  # held, or a module that comes later could have the address of one that went
+        # Held, or a module that comes later could have the address of one that went.
+        self._modules = list(network.modules())
         self._members = [
             entries for module in self._modules for entries in (module._modules, module._parameters) if entries
         ]

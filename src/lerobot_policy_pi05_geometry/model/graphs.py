@@ -64,10 +64,8 @@ class Recorded[T]:
     """A recorded function. Calling it copies the tensors of its arguments into its buffers, and computes `result` anew."""
 
     def __init__(self, recorder: Recorder, function: Callable[..., T], *arguments: Any) -> None:
-        with (
-            torch.inference_mode(False),
-            torch.no_grad(),
-        ):  # buffers made in inference mode could be written to only there
+        # Buffers made in inference mode could be written to only there.
+        with torch.inference_mode(False), torch.no_grad():
             buffers = tree_map(lambda x: x.clone() if isinstance(x, Tensor) else x, arguments)
             self._buffers = _tensors(buffers)
             self.result, self._replay = recorder.record(lambda: function(*buffers))
