@@ -41,6 +41,7 @@ ARMS = {
     "gate-closed": _geometry("gate started almost closed", geometry_gate_init="-8"),
     "flow-time": _geometry("segment conditioned on the current flow time", geometry_time="denoise"),
     "own-expert": _geometry("an expert of its own for geometry", geometry_expert="own"),
+    "dropout": _geometry("geometry left out of half of the training samples, not of a tenth", geometry_dropout="0.5"),
     "parallel": _geometry("parallel positions", geometry_positions="parallel"),
     "camera-frame": _geometry("points in the camera's frame", geometry_frame="camera"),
     "grid-4": _geometry("4 x 4 cells", geometry_grid="4"),
