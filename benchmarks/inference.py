@@ -5,7 +5,7 @@
     python -m benchmarks.inference --cameras 1 3 --full --device cuda --compiled ours --da3 base --trace traces
     python -m benchmarks.inference --cameras 1 3 --full --device cuda --compiled lerobot
 
-All arms run the same weights and observations in one process, in turn, round by round; a ratio is the median over rounds of
+All arms run the same weights and observations in one process, in turn, round by round, each round another first; a ratio is the median over rounds of
 an arm's time over eager LeRobot's in the same round. Ours is what a policy uses by default (the runner; on a GPU as CUDA graphs,
 with an arm without them beside it), with geometry features given: what measures depth is not in it. `--da3` adds two arms that
 also measure: Depth Anything 3 with random weights on the same cameras, beside vision and prefix, and before them. Ours pads the
@@ -20,6 +20,7 @@ import json
 import platform
 import statistics
 import time
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -257,9 +258,11 @@ def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) 
     functions = chunk_functions(args, cameras, ours, lerobot)
     times: dict[str, list[float]] = {arm: [] for arm in functions}
     first, memory = first_chunks(args, functions, ours, lerobot)
+    turn = deque(functions)
     for round_index in range(args.rounds + args.warmup):
-        for arm, function in functions.items():
-            value = seconds(function, args.device)
+        turn.rotate()  # no arm always comes after the same other one
+        for arm in turn:
+            value = seconds(functions[arm], args.device)
             if round_index >= args.warmup:
                 times[arm].append(value)
     result = {}
