@@ -5,14 +5,14 @@
     python -m benchmarks.inference --cameras 1 3 --full --device cuda --compiled ours --da3 base --trace traces
     python -m benchmarks.inference --cameras 1 3 --full --device cuda --compiled lerobot
 
-All arms run the same weights and observations in one process, in turn, round by round, each round another first; a ratio is the median over rounds of
-an arm's time over eager LeRobot's in the same round. Ours is what a policy uses by default (the runner; on a GPU as CUDA graphs,
-with an arm without them beside it), with geometry features given: what measures depth is not in it. `--da3` adds two arms that
-also measure: Depth Anything 3 with random weights on the same cameras, beside vision and prefix, and before them. Ours pads the
-prompt (`--prompt` tokens) to what it needs, on a GPU to the next multiple of 32; LeRobot's always to 200. The floor is what this
-machine's own matrix products and memory would need for our network's products alone, measured in the same run. `far` is the
-distance of the runner's actions from the plain path's, over the size of those. Memory is the peak of live tensors in the first
-chunk, weights, what is built and recorded for it included; on a CPU not of the compiled arms, which cannot be watched.
+All arms run the same weights and observations in one process, in turn, round by round, each round another first; a ratio is the
+median over rounds of an arm's time over eager LeRobot's in the same round. Ours is what a policy uses by default (the runner; on
+a GPU as CUDA graphs, with an arm without them beside it), with geometry features given: what measures depth is not in it. `--da3`
+adds two arms that also measure: Depth Anything 3 with random weights on the same cameras, beside vision and prefix, and before
+them. Ours pads the prompt (`--prompt` tokens) to what it needs, on a GPU to the next multiple of 32; LeRobot's always to 200. The
+floor is what this machine's own matrix products and memory would need for our network's products alone, measured in the same run.
+`far` is the distance of the runner's actions from the plain path's, over the size of those. Memory is the peak of live tensors in
+the first chunk; on a CPU the compiled arms cannot be watched.
 """
 
 import argparse
