@@ -19,8 +19,9 @@ class _LiveTensors(TorchDispatchMode):
         self.known: set[int] = set()
 
     def add(self, tensor: Tensor) -> None:
-        storage = tensor.untyped_storage()
-        key, size = storage._cdata, storage.nbytes()
+        packed = tensor.is_mkldnn  # which has no storage
+        storage = tensor if packed else tensor.untyped_storage()
+        key, size = id(tensor) if packed else storage._cdata, storage.nbytes if packed else storage.nbytes()
         if key not in self.known:
             self.known.add(key)
             self.bytes += size

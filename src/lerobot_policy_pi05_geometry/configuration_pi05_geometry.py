@@ -86,9 +86,8 @@ class PI05GeometryConfig(PreTrainedConfig):
     calibration_path: str | None = None  # JSON file; None: calibration.json in the dataset's meta folder
     calibration: dict[str, CameraCalibration] = field(default_factory=dict)  # what was read from it
     calibration_given: bool = False  # whether it was given as a file, and so holds over a dataset's own
-    geometry_features: dict[str, PolicyFeature] = field(
-        default_factory=dict
-    )  # depth and poses, set by validate_features
+    # Depth and poses, set by validate_features.
+    geometry_features: dict[str, PolicyFeature] = field(default_factory=dict)
     # Depth cameras that a converted checkpoint has embeddings for, before any data has named them; then 0.
     geometry_pending: int = 0
 
@@ -126,9 +125,8 @@ class PI05GeometryConfig(PreTrainedConfig):
     image_resolution: tuple[int, int] = (224, 224)
     empty_cameras: int = 0
     absent_cameras: list[str] = field(default_factory=list)  # RGB keys that observations may lack
-    optional_cameras: dict[str, PolicyFeature] = field(
-        default_factory=dict
-    )  # empty and absent ones, set by validate_features
+    # Empty and absent ones, set by validate_features.
+    optional_cameras: dict[str, PolicyFeature] = field(default_factory=dict)
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {

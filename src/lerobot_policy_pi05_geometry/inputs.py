@@ -67,9 +67,8 @@ def check_stats(config: PI05GeometryConfig, stats: Mapping[str, Mapping[str, Any
     features = {**(config.input_features or {}), **(config.output_features or {})}
     for key, feature in features.items():
         mode = config.normalization_mapping.get(FeatureType(feature.type).value, NormalizationMode.IDENTITY)
-        if mode not in _QUANTILES or (
-            key == OBS_STATE and key not in stats
-        ):  # a state that the data lacks is filled in
+        filled_in = key == OBS_STATE and key not in stats  # a state that the data lacks
+        if mode not in _QUANTILES or filled_in:
             continue
         low_name, high_name = _QUANTILES[mode]
         if low_name not in stats.get(key, {}) or high_name not in stats[key]:

@@ -106,9 +106,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def _set_trainable(self) -> None:
         network = self.model.paligemma_with_expert
         network.set_trainable(self.config.train_expert_only, self.config.freeze_vision_encoder)
-        if all(
-            key.startswith(EMPTY_CAMERA) for key in self.config.image_features
-        ):  # a policy without RGB runs no vision tower, so it must not wait for its gradient
+        # A policy without RGB runs no vision tower, so it must not wait for its gradient.
+        if all(key.startswith(EMPTY_CAMERA) for key in self.config.image_features):
             network.paligemma.model.vision_tower.requires_grad_(False)
             network.paligemma.model.multi_modal_projector.requires_grad_(False)
 

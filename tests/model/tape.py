@@ -16,7 +16,9 @@ WAITS = {"_local_scalar_dense", "item", "is_nonzero", "equal", "nonzero", "maske
 
 
 def storages(tree: Any) -> set[int]:
-    return {leaf.untyped_storage()._cdata for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)}
+    """Of all tensors but packed matrices, which have none and are never written to."""
+    tensors = [leaf for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)]
+    return {tensor.untyped_storage()._cdata for tensor in tensors if not tensor.is_mkldnn}
 
 
 class Tape(TorchDispatchMode):

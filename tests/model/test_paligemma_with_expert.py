@@ -94,9 +94,8 @@ def test_placement_in_the_prefix_does_disturb_it() -> None:
     changed = batch._replace(geom_embs=-batch.geom_embs)
     image_tokens = slice(0, 4)
     (before, _), (after, _) = (prefix_in_sampling(network, b) for b in (batch, changed))
-    assert torch.equal(
-        before[0, ..., image_tokens, :], after[0, ..., image_tokens, :]
-    )  # the first layer has not looked yet
+    # The first layer has not looked yet.
+    assert torch.equal(before[0, ..., image_tokens, :], after[0, ..., image_tokens, :])
     assert distance(before[1, ..., image_tokens, :], after[1, ..., image_tokens, :]) > 1e-3
 
 

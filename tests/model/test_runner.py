@@ -122,9 +122,8 @@ def test_joined_matrices_are_the_networks_own_storage(dtype: torch.dtype) -> Non
     before, weights = storage_bytes(network), copy.deepcopy(network.state_dict())
     runner = ChunkRunner(network)
     assert storage_bytes(network) == before
-    joined = {
-        m.untyped_storage().data_ptr() for layers in runner._layers.values() for w in layers for m in (w.qkv, w.gate_up)
-    }
+    matrices = [m for layers in runner._layers.values() for w in layers for m in (w.qkv, w.gate_up)]
+    joined = {m.untyped_storage().data_ptr() for m in matrices if not m.is_mkldnn}
     assert joined <= {p.untyped_storage().data_ptr() for p in network.parameters()}
     for name, tensor in network.state_dict().items():
         assert torch.equal(tensor, weights[name]), name
@@ -170,19 +169,23 @@ def new_parameters(network: PI05Pytorch) -> None:
 
 def new_modules(network: PI05Pytorch) -> None:
     for layer in network.paligemma_with_expert.expert.layers:
-        fresh = nn.Linear(layer.mlp.up_proj.in_features, layer.mlp.up_proj.out_features, bias=False)
-        layer.mlp.up_proj = fresh
+        shape = layer.mlp.up_proj.in_features, layer.mlp.up_proj.out_features
+        layer.mlp.up_proj = nn.Linear(*shape, bias=False, dtype=layer.mlp.up_proj.weight.dtype)
 
 
 def new_modules_where_old_ones_were(network: PI05Pytorch) -> None:
     """As when something wraps a projection, and hands another one back: nothing of the old one is left, but maybe its address."""
     for layer in network.paligemma_with_expert.expert.layers:
         shape = layer.mlp.up_proj.in_features, layer.mlp.up_proj.out_features
+        dtype = layer.mlp.up_proj.weight.dtype
         layer.mlp.up_proj = nn.Identity()
-        layer.mlp.up_proj = nn.Linear(*shape, bias=False)
+        layer.mlp.up_proj = nn.Linear(*shape, bias=False, dtype=dtype)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+DTYPES = [(torch.float32, torch.float32), (torch.bfloat16, torch.float32), (torch.bfloat16, torch.bfloat16)]
+
+
+@pytest.mark.parametrize(("dtype", "param_dtype"), DTYPES)
 @pytest.mark.parametrize(
     "change",
     [
@@ -197,9 +200,9 @@ def new_modules_where_old_ones_were(network: PI05Pytorch) -> None:
     ],
     ids=lambda f: f.__name__,
 )
-def test_weights_that_changed_after_building_act(change, dtype: torch.dtype) -> None:
-    """Joined in place (float32) or copied (bf16 over float32), stale matrices and modulations never act."""
-    network = build_network(SEGMENT, seed=51, dtype=dtype).eval()
+def test_weights_that_changed_after_building_act(change, dtype: torch.dtype, param_dtype: torch.dtype) -> None:
+    """Joined in place, copied (bf16 over float32) or packed (bf16), stale matrices and modulations never act."""
+    network = build_network(SEGMENT, seed=51, dtype=dtype, param_dtype=param_dtype).eval()
     runner = ChunkRunner(network)
     batch = draw(network, Case(seed=7, batch=2))
     before = fast(runner, batch)
@@ -210,10 +213,10 @@ def test_weights_that_changed_after_building_act(change, dtype: torch.dtype) -> 
     assert torch.allclose(after, fast(fresh, batch), atol=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_any_single_parameter_acts_as_it_is_now(dtype: torch.dtype) -> None:
+@pytest.mark.parametrize(("dtype", "param_dtype"), DTYPES)
+def test_any_single_parameter_acts_as_it_is_now(dtype: torch.dtype, param_dtype: torch.dtype) -> None:
     """Written through `.data`, in whole, one parameter after the other: what is computed from weights is never kept."""
-    network = build_network(OWN_EXPERT, seed=52, dtype=dtype).eval()
+    network = build_network(OWN_EXPERT, seed=52, dtype=dtype, param_dtype=param_dtype).eval()
     runner = ChunkRunner(network)
     batch = draw(network, Case(seed=7, batch=2))
     moved = 0

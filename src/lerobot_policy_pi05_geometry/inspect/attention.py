@@ -35,9 +35,8 @@ def suffix_attention(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) ->
     def hook(index: int):
         def record(_: nn.Module, inputs: tuple) -> None:
             q, k, _, mask, bias = inputs
-            if q.shape[2] == suffix_length and k.shape[2] >= total.get(
-                index, 0
-            ):  # geometry's own queries see fewer keys
+            # Geometry's own queries see fewer keys.
+            if q.shape[2] == suffix_length and k.shape[2] >= total.get(index, 0):
                 total[index] = k.shape[2]
                 seen[index] = attention_weights(q, k, mask, bias).float().mean(dim=(1, 2))
 

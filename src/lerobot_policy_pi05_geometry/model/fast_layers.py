@@ -13,6 +13,7 @@ from torch import Tensor
 from .cache import SegmentKVCache
 from .fused import FusedLayer
 from .gemma import RMS_EPS
+from .packed import linear
 from .variants import GemmaVariant
 
 
@@ -71,10 +72,10 @@ def run_layers(
         attend = _attend_in_products if frame.written_out else F.scaled_dot_product_attention
         attended = attend(queries, seen_keys, seen_values, frame.masks[index])  # (B, KV, H / KV * N, D)
         heads = attended.unflatten(2, (-1, x.shape[1])).flatten(1, 2)  # (B, H, N, D)
-        update = F.linear(heads.transpose(1, 2).flatten(2), weights.out)
+        update = linear(heads.transpose(1, 2).flatten(2), weights.out)
         x = _add(x, update, modulation, 0)
-        gate, up = F.linear(_norm(x, weights.post_norm, modulation, 1), weights.gate_up).chunk(2, dim=-1)
-        x = _add(x, F.linear(F.gelu(gate, approximate="tanh").mul_(up), weights.down), modulation, 1)
+        gate, up = linear(_norm(x, weights.post_norm, modulation, 1), weights.gate_up).chunk(2, dim=-1)
+        x = _add(x, linear(F.gelu(gate, approximate="tanh").mul_(up), weights.down), modulation, 1)
     return x
 
 
@@ -92,8 +93,8 @@ def _attention_inputs(
     """Write the segment's keys and values to the cache; return its queries (B, KV, H / KV * N, D)."""
     kv = variant.num_kv_heads
     heads = 0 if keys_only else variant.num_heads
-    matrix = weights.qkv[variant.num_heads * variant.head_dim :] if keys_only else weights.qkv
-    projected = F.linear(_norm(x, weights.norm, modulation, 0), matrix)
+    first = variant.num_heads * variant.head_dim if keys_only else 0
+    projected = linear(_norm(x, weights.norm, modulation, 0), weights.qkv, first)
     projected = projected.unflatten(-1, (-1, variant.head_dim)).transpose(1, 2)  # (B, heads + 2 KV, N, D)
     turned = _rotate(projected[:, : heads + kv], frame.cos, frame.sin)
     keys[:, :, span].copy_(turned[:, heads:])

@@ -130,9 +130,8 @@ class PI05Pytorch(nn.Module):
         entries, one block by default. The rest as in `embed_prefix`.
         """
         samples = noise.shape[1] if noise.ndim == 4 else 1
-        if (
-            noise.ndim == 4 and self._geometry_follows_time
-        ):  # every flow time has a geometry of its own: nothing to share
+        # Every flow time has a geometry of its own: nothing to share.
+        if noise.ndim == 4 and self._geometry_follows_time:
             observation, geometry_given = (images, img_masks, tokens, masks), (geom_embs, geom_pad, geom_att)
             flow = zip(noise.unbind(1), time.unbind(1), strict=True)
             return torch.stack([self.forward(*observation, actions, n, t, *geometry_given) for n, t in flow], dim=1)

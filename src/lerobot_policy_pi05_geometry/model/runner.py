@@ -27,8 +27,9 @@ from torch.utils._pytree import tree_leaves
 from .attention import rotary_table
 from .cache import SegmentKVCache
 from .fast_layers import LayerModulation, Modulation, SegmentFrame, adaptive_norm, run_layers, write_attention_out
-from .fused import FusedLayer, Weights, copied, fuse
+from .fused import FusedLayer, Weights, copied, fuse, pack_joined
 from .layout import Segment, one_block, segment_mask, segment_positions
+from .packed import pack, why_not_packed
 from .pi05 import PI05Pytorch, SegmentTokens
 from .precision import Float32Linear, compute_in
 from .side_stream import GeometryTokens, PendingGeometry, SideStream
@@ -91,20 +92,25 @@ class ChunkRunner:
         network, dtype = self.network.paligemma_with_expert, self.config.dtype
         self.device = self.network.action_in_proj.weight.device
         models = {segment: network.segment_model(segment) for segment in Segment}
+        packs = why_not_packed(self.kernels, dtype) is None
         fused: dict[int, list[FusedLayer]] = {}
-        for model in models.values():
-            if id(model) not in fused:
-                fused[id(model)] = fuse(model, dtype)
+        read: list[Tensor] = []
+        for model in {id(model): model for model in models.values()}.values():
+            packed = packs and model is models[Segment.SUFFIX]  # whose weights are read at every denoising step
+            layers = fuse(model, dtype)
+            fused[id(model)] = [pack_joined(layer, self._pack) for layer in layers] if packed else layers
+            read += copied(model, dtype, packed)
         self._models = models
         self._layers = {segment: fused[id(model)] for segment, model in models.items()}
         self._side = SideStream(self.device)
         self._kept: dict[tuple[Segment, int], list[FlowTime]] = {}
-        distinct = {id(model): model for model in models.values()}.values()
-        read = [weight for model in distinct for weight in copied(model, dtype)]
         if self._may_look:  # what modulations are kept of: the norms' linear maps and the flow time's
             linears = [module for module in self.network.modules() if isinstance(module, Float32Linear)]
             read += [parameter.detach() for linear in linears for parameter in linear.parameters()]
         self._weights = Weights(self.network, read)
+
+    def _pack(self, matrix: Tensor) -> Tensor:
+        return pack(matrix, self.config.chunk_size)
 
     def tensors(self) -> list[Tensor]:
         """All that is kept between chunks; some of it is the network's own storage (fused.py)."""

@@ -139,9 +139,8 @@ class FakePolicy:
         state, workspace = self._optimiser(load)
         step = self._step(replace(load, optimizer="adamw"))
         new = [p for p in self.policy.new_parameters().values() if p.requires_grad]
-        before = sum(
-            rounded(p.nbytes, _block(load.target)) for p in new
-        )  # `update` keeps them, to measure how far they move
+        # `update` keeps them, to measure how far they move.
+        before = sum(rounded(p.nbytes, _block(load.target)) for p in new)
         running = replace(step.largest, optimiser=state, activations=step.largest.activations + before)
         at_update = before + workspace + step.batch
         updating = replace(step.largest, gradients=step.gradients, optimiser=state, activations=at_update)
