@@ -37,17 +37,27 @@ from lerobot_policy_pi05_geometry.geometry.da3.encoder import store_products_in
 from lerobot_policy_pi05_geometry.model import PI05Pytorch
 from lerobot_policy_pi05_geometry.model.fast_layers import run_layers
 from lerobot_policy_pi05_geometry.model.graphs import GraphRunner
+from lerobot_policy_pi05_geometry.model.packed import why_not_packed
 from lerobot_policy_pi05_geometry.model.runner import Chunk, ChunkRunner, Observation
 from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.model.side_stream import GeometryTokens, PendingGeometry
 
 EAGER, COMPILED, GEOMETRY, PLAIN = "lerobot", "lerobot compiled", "geometry", "no geometry"
 NO_GRAPHS, OWN_COMPILED, BESIDE, BEFORE = "geometry, no graphs", "geometry, compiled", "da3 beside", "da3 before"
+UNPACKED = "geometry, not packed"
 PAIRS = {
     "beside over before": (BESIDE, BEFORE),
     "graphs over none": (GEOMETRY, NO_GRAPHS),
     "compiled over not": (OWN_COMPILED, GEOMETRY),
+    "packed over not": (GEOMETRY, UNPACKED),
 }
+
+
+class Unpacked(ChunkRunner):
+    """A runner that reads every matrix as it lies."""
+
+    def _pack(self, matrix: Tensor) -> Tensor:
+        return matrix
 
 
 class CompiledWhole(ChunkRunner):
@@ -119,19 +129,22 @@ def da3(args: argparse.Namespace, observation: Observation, ours: PI05Pytorch) -
 
 
 def chunk_functions(
-    args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot
+    args: argparse.Namespace, cameras: int, sampler: ChunkSampler, ours: PI05Pytorch, lerobot
 ) -> dict[str, Callable[[], Tensor]]:
     """A chunk of each arm, from the same observation."""
     (short, noise), (padded, _) = observe(args, cameras, args.prompt), observe(args, cameras, 200)
     # Inductor's own graphs, LeRobot's here, clear workspaces that ours would go on using.
     runner = "eager" if args.device != "cpu" and "lerobot" in args.compiled else "fast"
-    sample = partial(ChunkSampler(ours), *short, noise=noise, runner=runner)
+    sample = partial(sampler, *short, noise=noise, runner=runner)
     tokens = geometry_tokens(args, ours)
     functions: dict[str, Callable[[], Tensor]] = {
         GEOMETRY: lambda: sample(geom_embs=tokens),
         PLAIN: sample,
         EAGER: lambda: lerobot.sample_actions(*padded, noise=noise),
     }
+    if why_not_packed(args.device, ours.config.dtype) is None:
+        unpacked = Unpacked(ours)
+        functions[UNPACKED] = lambda: unpacked(*short, noise=noise, geom_embs=tokens)
     if args.device != "cpu" and runner == "fast":
         functions[NO_GRAPHS] = lambda: sample(geom_embs=tokens, runner="eager")
     if args.da3:
@@ -238,7 +251,11 @@ def floor(args: argparse.Namespace, cameras: int, ours: PI05Pytorch) -> dict[str
 
 
 def first_chunks(
-    args: argparse.Namespace, functions: dict[str, Callable[[], Tensor]], ours: PI05Pytorch, lerobot
+    args: argparse.Namespace,
+    functions: dict[str, Callable[[], Tensor]],
+    sampler: ChunkSampler,
+    ours: PI05Pytorch,
+    lerobot,
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Seconds of every arm's first chunk, which is compiled or recorded, if so; and the most memory it takes, in MiB."""
     first, memory = {}, {}
@@ -248,16 +265,18 @@ def first_chunks(
             continue
         network = lerobot if arm in (EAGER, COMPILED) else ours
         start = time.perf_counter()
-        memory[arm] = peak_memory(network, function)
+        kept = sampler.tensors() if arm == PLAIN else []  # by the arm before, which has the same runner
+        memory[arm] = peak_memory(network, function, kept)
         first[arm] = time.perf_counter() - start
     return first, memory
 
 
 def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) -> dict:
     """Times of all arms with this many cameras."""
-    functions = chunk_functions(args, cameras, ours, lerobot)
+    sampler = ChunkSampler(ours)
+    functions = chunk_functions(args, cameras, sampler, ours, lerobot)
     times: dict[str, list[float]] = {arm: [] for arm in functions}
-    first, memory = first_chunks(args, functions, ours, lerobot)
+    first, memory = first_chunks(args, functions, sampler, ours, lerobot)
     turn = deque(functions)
     for round_index in range(args.rounds + args.warmup):
         turn.rotate()  # no arm always comes after the same other one

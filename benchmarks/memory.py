@@ -48,7 +48,7 @@ def peak_memory(module: nn.Module, step: Callable[[], object], held: Sequence[Te
     module.zero_grad()
     own = [*module.parameters(), *module.buffers(), *held]
     if own[0].is_cuda:
-        storages = {tensor.untyped_storage()._cdata: tensor.untyped_storage() for tensor in own if tensor.is_cuda}
+        storages = {tensor.untyped_storage()._cdata: tensor.untyped_storage() for tensor in own}
         before = torch.cuda.memory_allocated()
         torch.cuda.reset_peak_memory_stats()
         step()

@@ -1,7 +1,7 @@
 """A training step with gradient checkpointing against LeRobot's π0.5 with its own; memory of micro-batches; flow samples.
 
     python -m benchmarks.training_step                     small size, float32
-    python -m benchmarks.training_step --size mid          ten times wider layers, still for a CPU
+    python -m benchmarks.training_step --size mid          six times wider layers, still for a CPU
     python -m benchmarks.training_step --size full --device cuda    released size, bf16 compute over float32 weights
     python -m benchmarks.training_step --flow-samples 20   loss after 20 s of training at K = 1, 2, 4, 8
 

@@ -151,8 +151,8 @@ class PI05GeometryConfig(PreTrainedConfig):
     optimizer_weight_decay: float = 0.01
     optimizer_grad_clip_norm: float = 1.0
     # The new parameters (adapter with its embeddings, gate): π0.5's rate is for fine-tuning. No weight decay, which would
-    # open a negative gate. Adam moves the gate by about its rate each step: at 1e-3, 16 units take 16,000 steps, at 1e-2
-    # (what `pi05-geometry convert` writes) 1,600.
+    # open a negative gate. Adam moves the gate by about its rate each step: after the warm-up, 16 units take 16,000 steps at
+    # 1e-3 and 1,600 at 1e-2, which is what `pi05-geometry convert` writes.
     geometry_lr: float = 1e-3
     geometry_gate_lr: float = 1e-3
     geometry_eps: float = 1e-12  # a closed gate scales the adapter's gradients down

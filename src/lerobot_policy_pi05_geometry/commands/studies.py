@@ -37,7 +37,7 @@ def demo(
 def study(
     context: typer.Context,
     spec: Annotated[
-        str, typer.Option(help="A study's TOML file, or one that comes along: default, demo, smoke.")
+        str, typer.Option(help="A study's TOML file, or one that comes along: default, longer, demo, smoke.")
     ] = "default",
     output: Output = Path("study"),
     workers: Workers = None,

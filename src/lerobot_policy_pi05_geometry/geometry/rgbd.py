@@ -1,7 +1,7 @@
 """Geometry from depth cameras: metric depth -> point map -> per-cell statistics.
 
 Points in the robot's base frame say where things are whatever the camera's pose; in the camera frame they do not, and
-then the network has to undo the pose by itself. Which of the two helps more has not been measured here.
+then the network has to undo the pose by itself, which costs success where the camera stands elsewhere (docs/results.md).
 """
 
 from collections.abc import Mapping
