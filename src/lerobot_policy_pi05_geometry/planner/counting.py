@@ -108,9 +108,12 @@ class MemoryCounter(TorchDispatchMode):
 
 
 def storage_bytes(tensors: Iterable[Tensor], block: int = 1) -> int:
-    """Bytes of the distinct storages of these tensors, each rounded up to `block`; a packed matrix has none to share."""
-    tensors = list(tensors)
-    storages = [tensor.untyped_storage() for tensor in tensors if not tensor.is_mkldnn]
-    distinct = {storage._cdata: storage.nbytes() for storage in storages}
-    sizes = [*distinct.values(), *(tensor.nbytes for tensor in tensors if tensor.is_mkldnn)]
-    return sum(-(-size // block) * block for size in sizes)
+    """Bytes of the distinct storages of these tensors, each rounded up to `block`; a packed matrix is one by itself."""
+    distinct: dict[int, int] = {}
+    for tensor in tensors:
+        if tensor.is_mkldnn:
+            distinct[id(tensor)] = tensor.nbytes
+        else:
+            storage = tensor.untyped_storage()
+            distinct[storage._cdata] = storage.nbytes()
+    return sum(-(-size // block) * block for size in distinct.values())
