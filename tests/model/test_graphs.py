@@ -223,10 +223,14 @@ def test_geometry_is_measured_when_the_prefix_is_on_its_way(geometry: GeometrySe
     assert torch.equal(found, chunk(ChunkRunner(network), batch))
 
 
-@pytest.mark.parametrize(("make", "chunks"), [(ChunkRunner, 1000), (recording, 100)], ids=["eager", "recorded"])
-def test_many_chunks_leave_nothing_behind(make, chunks: int) -> None:
+@pytest.mark.parametrize(
+    ("make", "chunks", "dtype"),
+    [(ChunkRunner, 1000, torch.float32), (ChunkRunner, 1000, torch.bfloat16), (recording, 100, torch.float32)],
+    ids=["eager", "packed", "recorded"],
+)
+def test_many_chunks_leave_nothing_behind(make, chunks: int, dtype: torch.dtype) -> None:
     """Neither tensors nor memory, and every observation gives its first actions again."""
-    network = build_network(SEGMENT, seed=43).eval()
+    network = build_network(SEGMENT, seed=43, dtype=dtype).eval()
     runner, process = make(network), psutil.Process()
     batches = [draw(network, Case(seed=seed, batch=1, cameras=1, chunk=2, grid=2)) for seed in range(4)]
     first = [chunk(runner, batch, 1) for batch in batches]
