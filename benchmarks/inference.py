@@ -279,7 +279,7 @@ def measure(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) 
     first, memory = first_chunks(args, functions, sampler, ours, lerobot)
     turn = deque(functions)
     for round_index in range(args.rounds + args.warmup):
-        turn.rotate()  # no arm always comes after the same other one
+        turn.rotate()  # so that none is always first; the order stays the same otherwise
         for arm in turn:
             value = seconds(functions[arm], args.device)
             if round_index >= args.warmup:
