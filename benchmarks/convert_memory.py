@@ -19,9 +19,9 @@ import torch
 
 from benchmarks.lerobot_pi05 import build_lerobot_pi05
 from benchmarks.network import high_water_mark
-from lerobot_policy_pi05_geometry.conversion import convert, export
-from lerobot_policy_pi05_geometry.conversion.names import EMBEDDING
-from lerobot_policy_pi05_geometry.conversion.tensor_file import StoredTensor, read_tensors, write_tensors
+from lerobot_policy_pi05_geometry.checkpoint.conversion import convert, export
+from lerobot_policy_pi05_geometry.checkpoint.conversion.names import EMBEDDING
+from lerobot_policy_pi05_geometry.checkpoint.conversion.tensor_file import StoredTensor, read_tensors, write_tensors
 
 WEIGHTS = "model.safetensors"
 

@@ -29,7 +29,6 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
-from lerobot_policy_pi05_geometry.frozen import load_da3
 from lerobot_policy_pi05_geometry.geometry import CameraCalibration, GeometryEncoder
 from lerobot_policy_pi05_geometry.geometry.da3 import (
     BACKBONE_PREFIX,
@@ -38,12 +37,13 @@ from lerobot_policy_pi05_geometry.geometry.da3 import (
     Da3Encoder,
     default_image_size,
 )
+from lerobot_policy_pi05_geometry.geometry.da3.weights import load_da3
+from lerobot_policy_pi05_geometry.geometry.feature_store import FeatureStore, Manifest
+from lerobot_policy_pi05_geometry.geometry.feature_store.fingerprint import dataset_hash, frame_files
+from lerobot_policy_pi05_geometry.geometry.feature_store.match import STORES
+from lerobot_policy_pi05_geometry.geometry.feature_store.shards import writing
 from lerobot_policy_pi05_geometry.geometry.random_tokens import RandomSource
-from lerobot_policy_pi05_geometry.geometry.store import FeatureStore, Manifest
-from lerobot_policy_pi05_geometry.geometry.store.fingerprint import dataset_hash, frame_files
-from lerobot_policy_pi05_geometry.geometry.store.shards import writing
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
-from lerobot_policy_pi05_geometry.stored import STORES
 
 ARMS = ("none", "rgbd", "random", "da3", "features")
 CAMERAS = ("front", "left", "right")

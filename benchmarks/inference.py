@@ -34,13 +34,14 @@ from benchmarks.network import parts as lerobot_parts
 from lerobot_policy_pi05_geometry.geometry import GeometryEncoder
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS, Da3Backbone, Da3Encoder, Da3Source
 from lerobot_policy_pi05_geometry.geometry.da3.encoder import store_products_in
+from lerobot_policy_pi05_geometry.inference.cuda_graphs import GraphRunner
+from lerobot_policy_pi05_geometry.inference.layers import run_layers
+from lerobot_policy_pi05_geometry.inference.packed import why_not_packed
+from lerobot_policy_pi05_geometry.inference.runner import Chunk, ChunkRunner, Observation
+from lerobot_policy_pi05_geometry.inference.sampler import ChunkSampler
+from lerobot_policy_pi05_geometry.inference.side_stream import PendingGeometry
 from lerobot_policy_pi05_geometry.model import PI05Pytorch
-from lerobot_policy_pi05_geometry.model.fast_layers import run_layers
-from lerobot_policy_pi05_geometry.model.graphs import GraphRunner
-from lerobot_policy_pi05_geometry.model.packed import why_not_packed
-from lerobot_policy_pi05_geometry.model.runner import Chunk, ChunkRunner, Observation
-from lerobot_policy_pi05_geometry.model.sampler import ChunkSampler
-from lerobot_policy_pi05_geometry.model.side_stream import GeometryTokens, PendingGeometry
+from lerobot_policy_pi05_geometry.model.segments import GeometryTokens
 
 EAGER, COMPILED, GEOMETRY, PLAIN = "lerobot", "lerobot compiled", "geometry", "no geometry"
 NO_GRAPHS, OWN_COMPILED, BESIDE, BEFORE = "geometry, no graphs", "geometry, compiled", "da3 beside", "da3 before"

@@ -25,9 +25,9 @@ import torch
 from torch import Tensor
 
 from benchmarks.lerobot_pi05 import build_lerobot_pi05, copy_weights
+from lerobot_policy_pi05_geometry.inference.runner import ChunkRunner
 from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, NetworkConfig, PI05Pytorch
 from lerobot_policy_pi05_geometry.model.precision import Float32Module, compute_in
-from lerobot_policy_pi05_geometry.model.runner import ChunkRunner
 from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 
 ARMS = ("geometry", "no geometry", "lerobot")

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_policy_pi05_geometry.quantiles import write_frame_quantiles
+from lerobot_policy_pi05_geometry.data.quantiles import write_frame_quantiles
 
 FPS, STATE_DIM, ACTION_DIM = 10, 7, 5
 REPO_ID = "local/tiny"

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from lerobot_policy_pi05_geometry.cli import app
 
-from .conversion.sources import folder_contents, write_lerobot
+from .checkpoint.conversion.sources import folder_contents, write_lerobot
 
 
 def fail(*arguments: str) -> str:

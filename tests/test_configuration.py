@@ -11,7 +11,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.geometry.keys import is_geometry_key
 from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
-from tests.doors import FRONT, FRONT_DEPTH, STATE, WRIST, WRIST_DEPTH, WRIST_POSE, make_calibration, make_config
+from tests.entry_points import FRONT, FRONT_DEPTH, STATE, WRIST, WRIST_DEPTH, WRIST_POSE, make_calibration, make_config
 
 VISUAL = FeatureType.VISUAL
 

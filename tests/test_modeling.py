@@ -9,7 +9,7 @@ from lerobot.policies import make_policy as lerobot_make_policy
 
 from lerobot_policy_pi05_geometry import MetaworldRgbdEnv
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
-from tests.doors import (
+from tests.entry_points import (
     ACTION_DIM,
     CHUNK,
     FRONT,

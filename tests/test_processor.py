@@ -8,7 +8,7 @@ from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from lerobot_policy_pi05_geometry.processor_pi05_geometry import make_pi05_geometry_pre_post_processors
-from tests.doors import (
+from tests.entry_points import (
     ACTION_DIM,
     CHUNK,
     FRONT,

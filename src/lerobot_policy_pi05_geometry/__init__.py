@@ -1,28 +1,44 @@
 """π0.5 with a geometry segment: a LeRobot policy plugin.
 
 ```
-   cli                                       the pi05-geometry command
-   study, inspect, sim                       studies (the demo is the smallest), pictures, the simulated RGB-D robot
-   loading, conversion                       a checkpoint with its processors, for our commands; π0.5 in and out
-   configuration_, modeling_, processor_     LeRobot's three doors, thin
-   inputs, prompt, checkpoints, frozen       what arrives is checked; weights in, strictly
-   geometry                                  observation -> geometry tokens
-   model                                     the network
+   cli                                          the pi05-geometry command
+   study                                        experiments: tasks x arms x seeds x conditions
+   inspect, planner, sim                        pictures and timings, memory planning, simulated RGB-D robots
+   checkpoint, precompute                       checkpoints loaded, merged and converted; features computed in advance
+   modeling_, processor_                        LeRobot's entry points: the policy and its processors
+   configuration_                               every setting of the policy
+   inference, training, data, geometry          action chunks, optimisation, inputs, observation -> geometry tokens
+   model, weight_files                          the network; files that hold weights
 ```
 
 Imports run downwards only. Importing this package registers the policy type `pi05_geometry`, its processor steps and the
 environment type `metaworld_rgbd` with LeRobot, which imports it by itself because of its name.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from .configuration_pi05_geometry import PI05GeometryConfig
-from .prompt import PortableTokenizerProcessorStep, PromptProcessorStep
+from .data.prompt import PortableTokenizerProcessorStep, PromptProcessorStep
 from .sim.configuration import MetaworldRgbdEnv
+
+if TYPE_CHECKING:
+    from .modeling_pi05_geometry import PI05GeometryPolicy
 
 __version__ = "0.1.0"
 __all__ = [
     "MetaworldRgbdEnv",
     "PI05GeometryConfig",
+    "PI05GeometryPolicy",
     "PortableTokenizerProcessorStep",
     "PromptProcessorStep",
     "__version__",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the policy class when it is asked for: LeRobot's plugin scan imports this package in every command."""
+    if name == "PI05GeometryPolicy":
+        from .modeling_pi05_geometry import PI05GeometryPolicy
+
+        return PI05GeometryPolicy
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -10,6 +10,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
+from .data.prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
 from .geometry.camera import CameraCalibration
 from .geometry.depth import METRES_PER_UNIT, MIN_DEPTH
 from .geometry.keys import DEPTH_SUFFIX, is_geometry_key
@@ -24,8 +25,7 @@ from .model.config import (
 )
 from .model.precision import DTYPES
 from .model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
-from .optimizer import OPTIMIZERS, AdamW8bitConfig
-from .prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
+from .training.optim import OPTIMIZERS, AdamW8bitConfig
 
 logger = logging.getLogger(__name__)
 
@@ -105,7 +105,7 @@ class PI05GeometryConfig(PreTrainedConfig):
     tokenizer_max_length: int = 200
 
     num_inference_steps: int = 10
-    # fast (model/runner.py, on a GPU as CUDA graphs), eager (without graphs), or plain: the reference that it must equal
+    # fast (inference/runner.py, on a GPU as CUDA graphs), eager (without graphs), or plain: the reference that it must equal
     inference_runner: str = "fast"
     flow_samples: int = (
         1  # noises and flow times per training sample; they share one pass over prefix and (clean) geometry

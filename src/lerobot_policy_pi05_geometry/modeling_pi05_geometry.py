@@ -25,21 +25,24 @@ from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor, nn
 
-from .checkpoints import find_file, load_strictly, require_policy_type
 from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
-from .frozen import load_da3
+from .data.images import prepare_images
+from .data.prompt import SMALL_TOKENIZER, small_number_ids
+from .data.statistics import check_stats
 from .geometry import GeometryEncoder, GeometrySource
 from .geometry.da3 import Da3Encoder
-from .inputs import check_stats, prepare_images
-from .lora import always_in_full, peft_targets
-from .micro_batches import each_of, require_whole_parameters, rows_of, sum_of
+from .geometry.da3.weights import load_da3
+from .geometry.resolve import build_source
+from .inference.sampler import ChunkSampler
+from .inference.side_stream import PendingGeometry
 from .model import PI05Pytorch
-from .model.flow import FlowDraw, draw_flow
-from .model.sampler import ChunkSampler
-from .model.side_stream import GeometryTokens, PendingGeometry
-from .optimizer import FULL_STATE
-from .prompt import SMALL_TOKENIZER, small_number_ids
-from .sources import build_source
+from .model.flow_matching import FlowDraw, draw_flow
+from .model.segments import GeometryTokens
+from .training.lora import always_in_full, peft_targets
+from .training.micro_batches import each_of, require_whole_parameters, rows_of, sum_of
+from .training.parameter_groups import FULL_STATE
+from .weight_files.files import find_file, require_policy_type
+from .weight_files.strict_load import load_strictly
 
 logger = logging.getLogger(__name__)
 

@@ -17,9 +17,9 @@ from lerobot.processor import (
 )
 
 from .configuration_pi05_geometry import PI05GeometryConfig
-from .inputs import check_stats
+from .data.prompt import PortableTokenizerProcessorStep, PromptProcessorStep, check_vocabulary
+from .data.statistics import check_stats
 from .model.variants import PALIGEMMA_VARIANTS
-from .prompt import PortableTokenizerProcessorStep, PromptProcessorStep, check_vocabulary
 
 
 def make_pi05_geometry_pre_post_processors(

@@ -5,7 +5,7 @@ import torch
 
 from lerobot_policy_pi05_geometry.inspect.attention import attention_layout, suffix_attention
 from lerobot_policy_pi05_geometry.inspect.pictures import depth_figure, layout_figure, segment_share_figure
-from tests.doors import CHUNK, make_batch, make_policy
+from tests.entry_points import CHUNK, make_batch, make_policy
 
 
 @pytest.fixture

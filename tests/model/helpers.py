@@ -22,7 +22,8 @@ from lerobot_policy_pi05_geometry.model import (
     Segment,
     SegmentKVCache,
 )
-from lerobot_policy_pi05_geometry.model.layout import segment_mask, segment_positions
+from lerobot_policy_pi05_geometry.model.segment_mask import segment_mask
+from lerobot_policy_pi05_geometry.model.segments import segment_positions
 from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 
 IMAGE_SIZE = 28  # four patches

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, PaliGemmaWithExpert, PI05Pytorch, Segment
 from lerobot_policy_pi05_geometry.model.attention import Attention
-from lerobot_policy_pi05_geometry.model.gate import GeometryGate
-from lerobot_policy_pi05_geometry.model.layout import segment_mask, segment_positions
+from lerobot_policy_pi05_geometry.model.segment_gate import GeometryGate
+from lerobot_policy_pi05_geometry.model.segment_mask import segment_mask
+from lerobot_policy_pi05_geometry.model.segments import segment_positions
 
 from .helpers import (
     IN_PREFIX,

@@ -9,8 +9,7 @@ from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from torch import Tensor
 
 from lerobot_policy_pi05_geometry.model import GeometrySegmentConfig, NetworkConfig, Segment
-from lerobot_policy_pi05_geometry.model.layout import one_block
-from lerobot_policy_pi05_geometry.model.pi05 import SegmentTokens
+from lerobot_policy_pi05_geometry.model.segments import SegmentTokens, one_block
 from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 
 from .helpers import (

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lerobot_policy_pi05_geometry.cli import app
-from lerobot_policy_pi05_geometry.commands.app import console
+from lerobot_policy_pi05_geometry.cli.app import console
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
 from lerobot_policy_pi05_geometry.planner.options import da3_variant
 
@@ -103,7 +103,7 @@ def test_one_sentence_for_what_cannot_be(arguments, message):
 
 def test_a_checkpoints_own_settings(tmp_path):
     from lerobot_policy_pi05_geometry.configuration_pi05_geometry import PI05GeometryConfig
-    from tests.doors import make_config
+    from tests.entry_points import make_config
 
     make_config(geometry_source="random")._save_pretrained(tmp_path)
     assert json.loads((tmp_path / "config.json").read_text())["type"] == PI05GeometryConfig.get_choice_name(
@@ -114,7 +114,7 @@ def test_a_checkpoints_own_settings(tmp_path):
 
 def test_a_proposal_says_what_the_checkpoint_has_otherwise(tmp_path):
     """What a checkpoint brings along stays unless it is said; what agrees with it is left out."""
-    from tests.doors import make_config
+    from tests.entry_points import make_config
 
     brought = {"dtype": "bfloat16", "param_dtype": "bfloat16", "train_expert_only": True, "optimizer": "adamw8bit"}
     make_config(geometry_source="none", gradient_checkpointing=True, **brought)._save_pretrained(tmp_path)

@@ -10,7 +10,7 @@ from torch import nn
 from torch._subclasses import FakeTensorMode
 from torch.distributed._tools.mem_tracker import MemTracker
 
-from lerobot_policy_pi05_geometry.model.packed import pack, why_not_packed
+from lerobot_policy_pi05_geometry.inference.packed import pack, why_not_packed
 from lerobot_policy_pi05_geometry.planner.acting import CountedSide
 from lerobot_policy_pi05_geometry.planner.counting import MemoryCounter, MemorySplit, storage_bytes
 

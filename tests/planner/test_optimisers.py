@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
-from lerobot_policy_pi05_geometry.optimizer import FULL_STATE
 from lerobot_policy_pi05_geometry.planner.optimisers import state_bytes, step_bytes
+from lerobot_policy_pi05_geometry.training.parameter_groups import FULL_STATE
 
 shapes = st.lists(st.tuples(st.integers(1, 90), st.integers(1, 90)), min_size=1, max_size=4)
 dtypes = st.sampled_from([torch.float32, torch.bfloat16])
@@ -30,7 +30,7 @@ def test_adamw_has_what_torch_keeps(sizes, dtype):
 def test_8_bits_are_what_torchao_keeps(shape, full):
     """In 8 bits from 4,096 numbers on, in whole blocks of 256, unless a group wants full state."""
     pytest.importorskip("torchao")
-    from lerobot_policy_pi05_geometry.adamw8bit import AdamW8bit
+    from lerobot_policy_pi05_geometry.training.adamw8bit import AdamW8bit
 
     parameter = nn.Parameter(torch.zeros(shape))
     group = {"params": [parameter], FULL_STATE: full}

@@ -11,7 +11,7 @@ from lerobot_policy_pi05_geometry.planner.counting import MemorySplit
 from lerobot_policy_pi05_geometry.planner.gpus import needed
 from lerobot_policy_pi05_geometry.planner.proposals import RECIPES, Fixed, Proposal, Rejection, _largest, propose
 from lerobot_policy_pi05_geometry.planner.workload import FakePolicy, Load
-from tests.doors import make_config
+from tests.entry_points import make_config
 
 MIB = 2**20
 NAMES = [recipe.name for recipe in RECIPES]

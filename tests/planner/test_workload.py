@@ -11,7 +11,7 @@ from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from lerobot_policy_pi05_geometry.planner.counting import storage_bytes
 from lerobot_policy_pi05_geometry.planner.workload import FakePolicy, Load
-from tests.doors import TOKENS, make_batch, make_config, without
+from tests.entry_points import TOKENS, make_batch, make_config, without
 
 PROMPT = make_batch()[TOKENS].shape[1]
 SETTINGS = [

@@ -13,12 +13,12 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_policy_pi05_geometry.geometry.store import FeatureStore
-from lerobot_policy_pi05_geometry.geometry.store.shards import ShardWriter
+from lerobot_policy_pi05_geometry.geometry.feature_store import FeatureStore
+from lerobot_policy_pi05_geometry.geometry.feature_store.shards import ShardWriter
 from lerobot_policy_pi05_geometry.precompute import Precompute, begin, disk_needed, prepare
 from tests.datasets import REPO_ID, write_dataset
 from tests.geometry.da3.tiny import write_tiny
-from tests.geometry.store.test_shards import files
+from tests.geometry.feature_store.test_shards import files
 
 BATCH = 2
 FRAMES = 26

@@ -12,9 +12,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
 
+from lerobot_policy_pi05_geometry.data.quantiles import write_frame_quantiles
 from lerobot_policy_pi05_geometry.geometry.calibration import read_calibration_file
 from lerobot_policy_pi05_geometry.geometry.camera import check_rigid, transform, unproject
-from lerobot_policy_pi05_geometry.quantiles import write_frame_quantiles
 from lerobot_policy_pi05_geometry.sim.cameras import CAMERA_RANGES, LOOK_AT
 from lerobot_policy_pi05_geometry.sim.configuration import MetaworldRgbdEnv
 from lerobot_policy_pi05_geometry.sim.environment import CAMERA, DEPTH_KEY, EXTRINSICS_KEY, RgbdMetaworldEnv

@@ -11,7 +11,7 @@ import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_policy_pi05_geometry.loading import LoadedPolicy
+from lerobot_policy_pi05_geometry.checkpoint.load import LoadedPolicy
 from lerobot_policy_pi05_geometry.sim.record import record
 from lerobot_policy_pi05_geometry.study.held_out import (
     ALL_CAMERAS,

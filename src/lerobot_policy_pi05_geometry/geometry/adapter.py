@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from ..model.precision import Float32Linear, Float32Module, compute_in_float32
-from ..model.side_stream import GeometryTokens
+from ..model.segments import GeometryTokens
 from .source import GeometryFeatures
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from ..model.precision import compute_in_float32
-from ..model.side_stream import GeometryTokens
+from ..model.segments import GeometryTokens
 from .adapter import GeometryAdapter
 from .keys import batch_like
 from .source import GeometryFeatures, GeometrySource

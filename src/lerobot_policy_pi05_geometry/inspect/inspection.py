@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from ..loading import load_policy
+from ..checkpoint.load import load_policy
 from .page import Page, picture
 from .pictures import depth_figure, layout_figure, segment_share_figure
 

@@ -6,23 +6,21 @@
    PaliGemma weights             action-expert weights        action-expert weights
   ├──────────── P ─────────────┤├────────── G ───────────┤├────────── S ──────────┤
 
-   variants    named sizes                        attention   one function for every query in the network
-   config      what the network has to be told    gemma       one transformer layer of one segment
-   layout      who sees whom, and at which place  vision      SigLIP, all cameras in one batch
-   cache       keys and values of an observation  paligemma_with_expert    the three segments, layer by layer
-   precision   what stays in float32, and why     pi05        embed, train, sample
-   gate        how open the door to geometry is   flow        noise that a resumed run draws again
-   runner      a whole chunk, fast: the network's arithmetic without its modules (fused: its matrices; fast_layers: its layers)
-   graphs      the runner's chunks as CUDA graphs                 side_stream    geometry measured beside vision and prefix
-   sampler     the runner, or the plain path where the runner does not apply
+   segments             the three segments: order, tokens, positions       gemma     one transformer layer of one segment
+   segment_mask         which segment attends to which                     attention one function for every query
+   segment_cache        keys and values kept between denoising steps       vision    SigLIP, all cameras in one batch
+   segment_gate         a learned weight of geometry in the actions' attention
+   paligemma_with_expert    the loop over segments, layer by layer         pi05      embed, train, sample
+   flow_matching        noise and flow times that a resumed run draws again
+   config, variants     what the network has to be told; named sizes       precision what stays in float32, and why
 ```
 """
 
-from .cache import SegmentKVCache
 from .config import GeometrySegmentConfig, NetworkConfig
-from .layout import Segment
 from .paligemma_with_expert import PaliGemmaWithExpert
 from .pi05 import PI05Pytorch
+from .segment_cache import SegmentKVCache
+from .segments import Segment
 
 __all__ = [
     "GeometrySegmentConfig",

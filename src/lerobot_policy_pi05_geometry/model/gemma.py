@@ -17,8 +17,8 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from .attention import Attention, apply_rotary
-from .cache import CacheSlot
 from .precision import Float32Linear, Float32Module
+from .segment_cache import CacheSlot
 from .variants import GemmaVariant
 
 RMS_EPS = 1e-6

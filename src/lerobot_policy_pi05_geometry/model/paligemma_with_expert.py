@@ -18,12 +18,12 @@ from torch.utils.checkpoint import checkpoint
 from transformers import SiglipVisionModel
 
 from .attention import rotary_table
-from .cache import SegmentKVCache
 from .config import NetworkConfig
-from .gate import GeometryGate
 from .gemma import GemmaModel, KeysValues
-from .layout import Segment
 from .precision import store_in
+from .segment_cache import SegmentKVCache
+from .segment_gate import GeometryGate
+from .segments import Segment
 from .vision import Projector, build_vision_tower, embed_images
 
 

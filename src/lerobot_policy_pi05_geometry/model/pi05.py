@@ -6,7 +6,6 @@ W expert width.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -14,29 +13,12 @@ from lerobot.policies.common.flow_matching import euler_integrate
 from lerobot.utils.device_utils import get_safe_dtype
 from torch import Tensor, nn
 
-from .cache import SegmentKVCache
 from .config import NetworkConfig
-from .layout import AttMasks, Segment, one_block, segment_mask, segment_positions
 from .paligemma_with_expert import PaliGemmaWithExpert
 from .precision import Float32Linear, compute_in
-
-
-class SegmentTokens(NamedTuple):
-    """Tokens of one segment: padding mask (B, N) bool, openpi's att_masks (N entries), and embeddings (B, N, W).
-
-    The embeddings are None where the segment's keys and values are read from the cache.
-    """
-
-    embs: Tensor | None
-    pad: Tensor
-    att: AttMasks
-
-    def followed_by(self, other: "SegmentTokens") -> "SegmentTokens":
-        """Both as one segment that is one block, in this one's dtype."""
-        assert self.embs is not None
-        assert other.embs is not None
-        embs = torch.cat([self.embs, other.embs.to(self.embs.dtype)], dim=1)
-        return SegmentTokens(embs, torch.cat([self.pad, other.pad], dim=1), [0] * embs.shape[1])
+from .segment_cache import SegmentKVCache
+from .segment_mask import segment_mask
+from .segments import AttMasks, Segment, SegmentTokens, one_block, segment_positions
 
 
 class PI05Pytorch(nn.Module):

@@ -7,12 +7,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from ..model.cache import SegmentKVCache
-from ..model.layout import Segment
+from ..inference.runner import ChunkRunner, Context, FlowTime, Observation
+from ..inference.sampler import ChunkSampler
+from ..inference.side_stream import SideStream
 from ..model.pi05 import PI05Pytorch
-from ..model.runner import ChunkRunner, Context, FlowTime, Observation
-from ..model.sampler import ChunkSampler
-from ..model.side_stream import GeometryTokens, SideStream
+from ..model.segment_cache import SegmentKVCache
+from ..model.segments import GeometryTokens, Segment
 from .counting import MemoryCounter
 
 Target = Literal["cuda", "cpu"]

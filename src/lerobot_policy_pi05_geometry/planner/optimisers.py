@@ -5,7 +5,8 @@ from typing import Any
 
 from torch import Tensor
 
-from ..optimizer import FULL_STATE, OPTIMIZERS
+from ..training.optim import OPTIMIZERS
+from ..training.parameter_groups import FULL_STATE
 
 # torchao: tensors of at least so many numbers, and of whole blocks, keep both moments in 8 bits, with a float32 scale per block
 # and a table of 256 numbers each.

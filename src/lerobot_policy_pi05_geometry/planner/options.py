@@ -8,10 +8,10 @@ from typing import Any
 import draccus
 from lerobot.configs import PreTrainedConfig
 
-from ..checkpoints import require_policy_type
 from ..configuration_pi05_geometry import PI05GeometryConfig
-from ..frozen import read_variant
 from ..geometry.da3 import VARIANTS, Da3Variant
+from ..geometry.da3.weights import read_variant
+from ..weight_files.files import require_policy_type
 
 _PREFIX, _PEFT = "--policy.", "--peft."
 _PEFT_RANK, _PEFT_METHOD, _PEFT_SCALE = "r", "method_type", "lora_alpha"

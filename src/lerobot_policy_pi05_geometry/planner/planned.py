@@ -9,9 +9,9 @@ from torch import Tensor
 from ..geometry import GeometrySource
 from ..geometry.da3 import Da3Encoder
 from ..geometry.source import GeometryFeatures
-from ..model.flow import FlowDraw
+from ..model.flow_matching import FlowDraw
 from ..model.precision import compute_in_float32
-from ..model.side_stream import GeometryTokens
+from ..model.segments import GeometryTokens
 from ..modeling_pi05_geometry import PI05GeometryPolicy
 
 

@@ -21,8 +21,8 @@ from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..geometry.da3 import Da3Backbone, Da3Encoder, Da3Source, Da3Variant
 from ..geometry.da3.encoder import store_products_in
 from ..geometry.keys import is_geometry_key
-from ..micro_batches import rows_of, sum_of
 from ..model.precision import DTYPES
+from ..training.micro_batches import rows_of, sum_of
 from .acting import CountedSampler, Target
 from .adapters import add_lora
 from .counting import CUDA_BLOCK, MemoryCounter, MemorySplit, storage_bytes

@@ -15,14 +15,14 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from ..configuration_pi05_geometry import PI05GeometryConfig
-from ..frozen import load_da3
 from ..geometry.da3 import Da3Source
-from ..geometry.store import FeatureStore, Manifest, read_manifest
-from ..geometry.store.fingerprint import dataset_hash, frame_files
-from ..geometry.store.manifest import MANIFEST_FILE
-from ..geometry.store.reader import missing_shards
-from ..geometry.store.shards import lock_beside, writing
-from ..stored import STORES
+from ..geometry.da3.weights import load_da3
+from ..geometry.feature_store import FeatureStore, Manifest, read_manifest
+from ..geometry.feature_store.fingerprint import dataset_hash, frame_files
+from ..geometry.feature_store.manifest import MANIFEST_FILE
+from ..geometry.feature_store.match import STORES
+from ..geometry.feature_store.reader import missing_shards
+from ..geometry.feature_store.shards import lock_beside, writing
 from .frames import Frames
 
 SHARD_FRAMES = 512  # 100 MB for one camera of DA3-BASE at 8 x 8: small enough to share out, few enough to list

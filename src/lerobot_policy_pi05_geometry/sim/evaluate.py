@@ -11,7 +11,7 @@ from lerobot.envs import preprocess_observation
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from scipy.stats import binomtest
 
-from ..loading import LoadedPolicy
+from ..checkpoint.load import LoadedPolicy
 from .configuration import MetaworldRgbdEnv
 
 CONFIDENCE = 0.95

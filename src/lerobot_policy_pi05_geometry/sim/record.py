@@ -9,8 +9,8 @@ import numpy as np
 from datasets.utils.logging import disable_progress_bar
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from ..data.quantiles import write_frame_quantiles
 from ..geometry.calibration import CALIBRATION_FILE, write_calibration_file
-from ..quantiles import write_frame_quantiles
 from .environment import ACTION_NAMES, CAMERA, DEPTH_KEY, EXTRINSICS_KEY, FPS, STATE_NAMES, RgbdMetaworldEnv
 from .tasks import make_expert
 

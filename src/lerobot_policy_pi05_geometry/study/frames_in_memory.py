@@ -16,7 +16,7 @@ from lerobot.scripts.lerobot_train import train
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from ..stored import refuse_augmentation
+from ..precompute.augmentation import refuse_augmentation
 
 
 class FramesInMemory(Dataset):

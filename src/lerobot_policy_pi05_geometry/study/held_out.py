@@ -20,8 +20,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetad
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from torch.utils.data import default_collate
 
+from ..checkpoint.load import LoadedPolicy, load_policy
 from ..geometry.keys import DEPTH_SUFFIX, depth_key
-from ..loading import LoadedPolicy, load_policy
 from .arms import find_arm
 from .runs import Run, Say, option_list, versions
 from .training import train_with

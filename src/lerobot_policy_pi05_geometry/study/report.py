@@ -8,10 +8,10 @@ import pandas as pd
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors import safe_open
 
+from ..checkpoint.load import load_policy
 from ..inspect.inspection import frame_batch
 from ..inspect.page import Page, picture, video
 from ..inspect.pictures import curves_figure, depth_figure, layout_figure, segment_share_figure, success_figure
-from ..loading import load_policy
 from .arms import ARMS
 from .conditions import CONDITIONS
 from .results import Cell, Versus, cells, comparisons, episodes_table, lead

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..loading import load_policy
+from ..checkpoint.load import load_policy
 from ..sim.cameras import CAMERA_RANGES
 from ..sim.configuration import MetaworldRgbdEnv
 from ..sim.evaluate import Evaluation, evaluate

@@ -6,7 +6,7 @@ from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.scripts.lerobot_train import train
 
-from ..stored import refuse_augmentation
+from ..precompute.augmentation import refuse_augmentation
 from .frames_in_memory import train_in_memory
 
 

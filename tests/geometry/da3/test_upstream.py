@@ -12,8 +12,6 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from lerobot_policy_pi05_geometry.checkpoints import load_strictly
-from lerobot_policy_pi05_geometry.frozen import read_variant
 from lerobot_policy_pi05_geometry.geometry.da3 import (
     BACKBONE_PREFIX,
     OTHER_PREFIXES,
@@ -22,6 +20,8 @@ from lerobot_policy_pi05_geometry.geometry.da3 import (
     Da3Variant,
     variant_of,
 )
+from lerobot_policy_pi05_geometry.geometry.da3.weights import read_variant
+from lerobot_policy_pi05_geometry.weight_files.strict_load import load_strictly
 
 pytestmark = pytest.mark.upstream
 

@@ -1,0 +1,69 @@
+"""A checkpoint with its processors, ready to act: what lerobot-eval does, for our own commands."""
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_policy, make_pre_post_processors
+
+from ..modeling_pi05_geometry import PI05GeometryPolicy
+from ..weight_files.files import require_policy_type
+
+
+@dataclass
+class LoadedPolicy:
+    """A policy with its processors."""
+
+    policy: PI05GeometryPolicy
+    preprocess: Callable[[dict], dict]
+    postprocess: Callable[[torch.Tensor], torch.Tensor]
+
+
+def load_policy(checkpoint: str | Path, device: str = "cpu", environment: Any | None = None) -> LoadedPolicy:
+    """Load a checkpoint folder or hub id; LoRA is folded into the weights.
+
+    environment: a LeRobot `EnvConfig` whose features the policy has to fit, or None.
+    Raises FileNotFoundError or ValueError, with one sentence, for what is no checkpoint of this policy.
+    """
+    require_policy_type(checkpoint, PI05GeometryPolicy.name)
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.pretrained_path = Path(checkpoint)
+    config.device = device
+    if config.use_peft:
+        policy = _fold_lora(checkpoint, config)
+    elif environment is None:
+        policy = PI05GeometryPolicy.from_pretrained(checkpoint, config=config)
+    else:
+        policy = make_policy(config, env_cfg=environment)
+    preprocess, postprocess = make_pre_post_processors(
+        policy_cfg=config,
+        pretrained_path=str(checkpoint),
+        preprocessor_overrides={"device_processor": {"device": device}},
+    )
+    return LoadedPolicy(policy, preprocess, postprocess)
+
+
+def _fold_lora(checkpoint: str | Path, config: PreTrainedConfig) -> PI05GeometryPolicy:
+    """The policy that a LoRA checkpoint was trained from, with what was trained folded into its weights.
+
+    Raises ImportError without PEFT, ValueError or FileNotFoundError if it is not known or there what it was trained from.
+    """
+    if importlib.util.find_spec("peft") is None:
+        raise ImportError(
+            f"{checkpoint} was trained with LoRA, which needs PEFT; install it with "
+            "`pip install 'lerobot_policy_pi05_geometry[lora]'`."
+        )
+    from peft import PeftConfig, PeftModel
+
+    adapter = PeftConfig.from_pretrained(str(checkpoint))
+    base = adapter.base_model_name_or_path
+    if not base:
+        raise ValueError(f"{checkpoint} does not say which policy it was trained from (base_model_name_or_path).")
+    policy = PI05GeometryPolicy.from_pretrained(base, config=config)
+    folded: PI05GeometryPolicy = PeftModel.from_pretrained(policy, str(checkpoint), config=adapter).merge_and_unload()
+    folded.config.use_peft = False
+    return folded.eval()

@@ -1,0 +1,36 @@
+"""The `pi05-geometry` command: its entry point. The commands stand beside it, one file per topic."""
+
+import logging
+import os
+import sys
+import warnings
+
+os.environ.setdefault("TQDM_DISABLE", "1")  # LeRobot's bars would draw over ours
+os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
+
+from rich.logging import RichHandler
+from rich.markup import escape
+
+from . import app, console
+
+
+def main() -> None:
+    """Entry point: errors of the user's input are one sentence, not a traceback."""
+    logging.basicConfig(
+        level=logging.WARNING, format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
+    )
+    for noisy in ("lerobot.utils.import_utils", "datasets", "httpx"):
+        logging.getLogger(noisy).setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", module="metaworld")
+    warnings.filterwarnings("ignore", module="gymnasium")
+    try:
+        app()
+    except (ValueError, FileNotFoundError, FileExistsError, ModuleNotFoundError, RuntimeError, OSError) as error:
+        if os.environ.get("PI05_GEOMETRY_TRACEBACK"):
+            raise
+        console.print(f"[bold red]Error[/bold red] {escape(str(error))}", soft_wrap=True)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""Commands on a checkpoint: inspect, bench, convert, export, merge."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .app import Output, app, console
+
+
+@app.command()
+def inspect(
+    checkpoint: Annotated[str, typer.Argument(help="Checkpoint folder (pretrained_model) or hub id.")],
+    dataset_root: Annotated[Path, typer.Option("--dataset.root", help="Folder of a LeRobotDataset.")],
+    dataset_repo_id: Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")] = "local/dataset",
+    frame: Annotated[int, typer.Option(help="Which frame of the dataset to look at.")] = 0,
+    device: Annotated[str, typer.Option(help="Where the policy runs.")] = "cpu",
+    output: Output = Path("inspect.html"),
+) -> None:
+    """Pictures of a checkpoint on a frame of a dataset: attention layout, depth with grid cells, where actions look."""
+    from ..inspect.inspection import write_inspection
+
+    write_inspection(checkpoint, dataset_root, dataset_repo_id, frame, device, output)
+    console.print(f"Open [bold]{output}[/bold]")
+
+
+@app.command()
+def bench(
+    checkpoint: Annotated[str, typer.Argument(help="Checkpoint folder (pretrained_model) or hub id.")],
+    device: Annotated[str, typer.Option(help="Where the policy runs.")] = "cpu",
+    dataset_root: Annotated[
+        Path | None, typer.Option("--dataset.root", help="Take the observation from this dataset; else it is random.")
+    ] = None,
+    dataset_repo_id: Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")] = "local/dataset",
+    rounds: Annotated[int, typer.Option(help="Predictions to time.")] = 20,
+) -> None:
+    """How long a checkpoint takes for an action chunk on this machine, where the time goes, and what would change it."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from rich.table import Table
+
+    from ..checkpoint.load import load_policy
+    from ..inspect.bench import bench as run
+    from ..inspect.bench import random_observation
+    from ..inspect.inspection import frame_batch
+
+    loaded = load_policy(checkpoint, device)
+    if dataset_root is None:
+        observation = random_observation(loaded.policy.config)
+    else:
+        unit = loaded.policy.config.depth_unit
+        observation = frame_batch(LeRobotDataset(dataset_repo_id, root=dataset_root, depth_output_unit=unit), 0)
+    result = run(loaded, observation, rounds)
+    table = Table("", "median ms", "95 % ms")
+    rows = {"action chunk": result.chunk, "by the plain path": result.plain} | {
+        f"  {name}": timing for name, timing in result.parts.items()
+    }
+    for name, timing in rows.items():
+        table.add_row(name, f"{timing.p50:.1f}", f"{timing.p95:.1f}")
+    console.print(table)
+    if result.peak_bytes is not None:
+        console.print(f"Peak memory: {result.peak_bytes / 2**30:.2f} GiB")
+    for name, state in result.explanation.items():
+        console.print(f"{name}: {state}", soft_wrap=True)
+    for sentence in result.advice:
+        console.print(f"→ {sentence}", soft_wrap=True)
+
+
+@app.command()
+def convert(
+    source: Annotated[str, typer.Argument(help="π0.5 checkpoint of LeRobot or openpi (PyTorch): folder or hub id.")],
+    output: Annotated[Path, typer.Argument(help="Folder to write; it must not be there.")],
+    geometry_source: Annotated[str, typer.Option(help="rgbd, random (control) or none.")] = "rgbd",
+    geometry_cameras: Annotated[
+        str | None,
+        typer.Option(help="Depth cameras in token order, as front,wrist. Default: the one that the data has."),
+    ] = None,
+    geometry_grid: Annotated[int, typer.Option(help="Cells per side and camera.")] = 8,
+    geometry_frame: Annotated[str, typer.Option(help="Points in the robot's base frame, or camera.")] = "base",
+    geometry_expert: Annotated[str, typer.Option(help="shared, or own: a copy of the action expert.")] = "shared",
+    geometry_gate: Annotated[float, typer.Option(help="Log-gate to start with; -16 is closed, 0 open.")] = -16.0,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration file. Default: the training data's meta/calibration.json.")
+    ] = None,
+    features_from_data: Annotated[
+        bool, typer.Option("--features-from-data", help="Cameras and state as the training data names them.")
+    ] = False,
+    chunk_size: Annotated[
+        int | None, typer.Option(help="Actions per chunk, where an openpi source does not say.")
+    ] = None,
+    tokenizer_path: Annotated[
+        str | None, typer.Option(help="Tokenizer folder or hub id. Default: the one the source names.")
+    ] = None,
+    revision: Annotated[str | None, typer.Option(help="Revision of a hub id.")] = None,
+    seed: Annotated[int, typer.Option(help="Another seed draws another geometry adapter.")] = 0,
+) -> None:
+    """Start from a π0.5: write a checkpoint of this policy that acts as the source does, ready for --policy.path.
+
+    Weights, settings and processor statistics carry over. An openpi checkpoint brings weights only: cameras and
+    statistics then come from the data it is trained on.
+    """
+    from ..checkpoint.conversion import GeometryStart
+    from ..checkpoint.conversion import convert as run
+
+    geometry = GeometryStart(
+        source=geometry_source,
+        cameras=None if geometry_cameras is None else tuple(geometry_cameras.split(",")),
+        calibration=calibration,
+        grid=geometry_grid,
+        frame=geometry_frame,
+        expert=geometry_expert,
+        gate=geometry_gate,
+    )
+    run(
+        source, output, geometry, features_from_data=features_from_data, chunk_size=chunk_size,
+        tokenizer=tokenizer_path, seed=seed, revision=revision,
+    )  # fmt: skip
+    console.print(f"Train it: lerobot-train --policy.path={output} --dataset.repo_id=you/your_dataset ...")
+
+
+@app.command()
+def export(
+    checkpoint: Annotated[str, typer.Argument(help="Checkpoint folder (pretrained_model) or hub id of this policy.")],
+    output: Annotated[Path, typer.Argument(help="Folder to write; it must not be there.")],
+) -> None:
+    """The way back: write a checkpoint as LeRobot's own π0.5 (--policy.type=pi05), without its geometry."""
+    from ..checkpoint.conversion import export as run
+
+    run(checkpoint, output)
+    console.print(f"LeRobot's π0.5 loads it: --policy.path={output}")
+
+
+@app.command()
+def merge(
+    checkpoint: Annotated[Path, typer.Argument(help="Folder of a checkpoint that was trained with --peft.")],
+    output: Annotated[Path, typer.Argument(help="Folder to write; it must not be there.")],
+) -> None:
+    """Fold LoRA into the weights: write a checkpoint that acts the same and needs neither PEFT nor its base."""
+    from ..checkpoint.merge import merge as run
+
+    run(checkpoint, output)
+    console.print(f"Wrote [bold]{output}[/bold].")

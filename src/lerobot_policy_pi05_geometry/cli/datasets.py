@@ -1,0 +1,67 @@
+"""Commands on a dataset: quantiles, precompute."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from .app import app, console
+
+
+@app.command()
+def quantiles(
+    dataset_root: Annotated[Path, typer.Option("--dataset.root", help="Folder of a LeRobotDataset.")],
+) -> None:
+    """Recompute a dataset's state and action quantiles over all frames (LeRobot averages those of single episodes)."""
+    from ..data.quantiles import write_frame_quantiles
+
+    for key, shares in write_frame_quantiles(dataset_root).items():
+        told = " -> ".join(" ".join(f"{share:.0%}" for share in row) for row in shares)
+        console.print(f"{key}: q01 to q99 covers of min to max, per dimension: {told}")
+
+
+@app.command()
+def precompute(
+    dataset_root: Annotated[
+        Path | None, typer.Option("--dataset.root", help="Folder of a LeRobotDataset; the hub's copy if left out.")
+    ] = None,
+    dataset_repo_id: Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")] = "local/dataset",
+    encoder: Annotated[
+        str, typer.Option(help="Depth Anything 3: hub id, folder or safetensors file.")
+    ] = "depth-anything/DA3-BASE",
+    grid: Annotated[int, typer.Option(help="Cells per side and camera: the policy's geometry_grid.")] = 8,
+    cameras: Annotated[
+        str | None, typer.Option(help="With commas, in token order; every RGB camera, sorted, if left out.")
+    ] = None,
+    image_size: Annotated[int | None, typer.Option(help="Pixels per side: the policy's da3_image_size.")] = None,
+    dtype: Annotated[str, typer.Option(help="What the encoder computes in: bfloat16 or float32.")] = "bfloat16",
+    batch_size: Annotated[int, typer.Option(help="Frames per pass of the encoder.")] = 16,
+    device: Annotated[str | None, typer.Option(help="Where the encoder runs; a GPU if there is one.")] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder for stores; the dataset's own if left out.")] = None,
+    shard_frames: Annotated[int, typer.Option(help="Frames per file.")] = 512,
+    check: Annotated[
+        bool, typer.Option("--verify", help="Read the finished store, and compare its checksums.")
+    ] = False,
+) -> None:
+    """Compute geometry from RGB once: Depth Anything 3's features of every frame, to train with geometry_source=features.
+
+    Killed and started again it goes on where it stopped. Several processes or machines that share the folder divide the work
+    when started with torchrun (`torchrun --nproc-per-node 4 --no-python pi05-geometry precompute ...`).
+    """
+    from ..precompute.command import run_precompute
+
+    names = None if cameras is None else cameras.split(",")
+    with Progress(
+        TextColumn("{task.description:<28}"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    ) as drawn:
+        run_precompute(
+            dataset_root, dataset_repo_id, encoder, grid, names, image_size, dtype, batch_size, device, output,
+            shard_frames, check, drawn,
+        )  # fmt: skip

@@ -1,0 +1,46 @@
+"""RGB images in the form that SigLIP expects."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from lerobot.policies.common.vla_utils import resize_with_pad_torch
+from torch import Tensor
+
+from ..geometry.images import rgb_image
+
+if TYPE_CHECKING:
+    from ..configuration_pi05_geometry import PI05GeometryConfig
+
+
+def prepare_images(
+    batch: Mapping[str, Tensor], config: "PI05GeometryConfig", device: torch.device
+) -> tuple[list[Tensor | None], list[Tensor]]:
+    """RGB cameras in the form SigLIP expects.
+
+    Images are (B, 3, H, W) or (B, H, W, 3), uint8 or float in [0, 1]; they are resized with black padding to
+    `image_resolution` and scaled to [-1, 1], as openpi does.
+
+    Returns per camera the images (B, 3, S, S) float32, or None for a camera that may be absent and is, and its mask (B,).
+    Raises ValueError for a camera that is missing or has a wrong shape.
+    """
+    images: list[Tensor | None] = []
+    masks = []
+    size = batch["observation.language.tokens"].shape[0]
+    for key in config.image_features:
+        absent = key not in batch
+        if absent and not config.may_be_absent(key):
+            raise ValueError(
+                f"The observation has no image {key}; connect the camera, rename its key with --rename_map, or, if "
+                f"this policy may run without it, list it in --policy.absent_cameras='[\"{key}\"]'."
+            )
+        images.append(None if absent else _prepare_image(batch[key].to(device), key, config))
+        masks.append(torch.full((size,), not absent, device=device))
+    return images, masks
+
+
+def _prepare_image(image: Tensor, key: str, config: "PI05GeometryConfig") -> Tensor:
+    image = rgb_image(image, key)
+    if tuple(image.shape[-2:]) != tuple(config.image_resolution):
+        image = resize_with_pad_torch(image, *config.image_resolution)
+    return image * 2.0 - 1.0

@@ -1,0 +1,111 @@
+"""A feature store matched to a policy and a dataset: found, compared, and recorded in the configuration.
+
+Training needs no encoder then; the checkpoint records which one the features are from, and acts with that one.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..da3 import default_image_size
+from ..da3.weights import backbone_hash, find_encoder
+from . import FeatureStore, Manifest, read_manifest
+from .fingerprint import changed_file, dataset_hash
+from .manifest import MANIFEST_FILE
+
+if TYPE_CHECKING:
+    from ...configuration_pi05_geometry import PI05GeometryConfig
+
+STORES = "geometry"  # folder of a dataset that holds its stores
+
+
+def open_store(config: "PI05GeometryConfig", root: Path) -> FeatureStore:
+    """The store for this policy and the dataset at `root`; records encoder, image size and hash in the configuration.
+
+    Raises FileNotFoundError or ValueError, with one sentence, if there is none, it does not fit, or it is damaged.
+    """
+    folder = Path(config.features_path) if config.features_path is not None else _find(config, root)
+    manifest = read_manifest(folder)
+    reason = misfit(config, manifest, root)
+    if reason is not None:
+        raise ValueError(f"The feature store {folder} does not fit: {reason}.")
+    store = FeatureStore(folder)
+    store.read_ahead()
+    config.da3_encoder = config.da3_encoder or manifest.encoder
+    config.da3_hash, config.da3_image_size = manifest.encoder_hash, manifest.image_size
+    return store
+
+
+def misfit(config: "PI05GeometryConfig", manifest: Manifest, root: Path) -> str | None:
+    """Why a store is none for this policy and the dataset at `root`, and what to do; None if it is one."""
+    anew = "run pi05-geometry precompute for it"
+    if manifest.dataset_hash != dataset_hash(root):
+        return f"the dataset {root} has changed since, or is another one (meta/info.json, meta/episodes); {anew}"
+    changed = changed_file(root, manifest.dataset_files)
+    if changed is not None:
+        return f"the dataset's {root / changed} has another size than when the features were computed; {anew}"
+    if manifest.grid != config.geometry_grid:
+        return (
+            f"it has {manifest.grid} x {manifest.grid} cells per camera, the policy {config.geometry_grid} x "
+            f"{config.geometry_grid}; set --policy.geometry_grid={manifest.grid}, or {anew}"
+        )
+    cameras = config.rgb_cameras()
+    if list(manifest.cameras.items()) != list(cameras.items()):
+        names = ",".join(f'"{name}"' for name in manifest.cameras)
+        return (
+            f"it has the cameras {_list(manifest.cameras)}, the policy {_list(cameras)}, in this order; set "
+            f"--policy.geometry_cameras='[{names}]', or {anew} (a store knows cameras by the dataset's own names, so none of "
+            "them may be in --rename_map)"
+        )
+    size = config.da3_image_size
+    if size is None:  # a policy that has seen images already saw them in the default size
+        size = manifest.image_size if config.da3_hash is None else default_image_size(config.geometry_grid)
+    for name, theirs, ours in (
+        ("da3_image_size", manifest.image_size, size),
+        ("da3_dtype", manifest.dtype, config.da3_dtype),
+    ):
+        if theirs != ours:
+            return (
+                f"it was computed with {name} {theirs}, the policy has {ours}; set --policy.{name}={theirs}, or {anew}"
+            )
+    return _other_encoder(config, manifest)
+
+
+def _other_encoder(config: "PI05GeometryConfig", manifest: Manifest) -> str | None:
+    """Why the features are from another encoder than the policy's; content decides, not the name."""
+    wanted = config.da3_hash
+    if wanted is None:
+        if config.da3_encoder in (None, manifest.encoder):
+            return None
+        wanted = backbone_hash(find_encoder(config.da3_encoder))
+    if wanted == manifest.encoder_hash:
+        return None
+    return (
+        f"its features are from another encoder: {manifest.encoder} (SHA-256 {manifest.encoder_hash}), the policy's is "
+        f"{config.da3_encoder} (SHA-256 {wanted}); run pi05-geometry precompute --encoder={config.da3_encoder}"
+    )
+
+
+def _find(config: "PI05GeometryConfig", root: Path) -> Path:
+    """The one store beside the dataset that fits."""
+    beside = root / STORES
+    found = sorted(path.parent for path in beside.glob(f"*/{MANIFEST_FILE}"))
+    if not found:
+        raise FileNotFoundError(
+            f"geometry_source=features needs a feature store, and {beside} has none; run pi05-geometry precompute "
+            f"--dataset.root={root}, or name one by --policy.features_path."
+        )
+    reasons = {folder: misfit(config, read_manifest(folder), root) for folder in found}
+    fitting = [folder for folder, reason in reasons.items() if reason is None]
+    if not fitting:
+        told = "; and ".join(f"{folder.name}: {reason}" for folder, reason in reasons.items())
+        raise ValueError(f"No feature store in {beside} fits: {told}.")
+    if len(fitting) > 1:
+        raise ValueError(
+            f"Several feature stores in {beside} fit ({', '.join(folder.name for folder in fitting)}); name one by "
+            "--policy.features_path."
+        )
+    return fitting[0]
+
+
+def _list(cameras: dict[str, str]) -> str:
+    return ", ".join(f"{name} ({key})" for name, key in cameras.items()) or "none"

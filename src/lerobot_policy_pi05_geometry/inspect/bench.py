@@ -1,0 +1,195 @@
+"""Where the time of an action chunk goes, for a user's own checkpoint on their own machine, and what would change it."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+from lerobot.configs import FeatureType
+from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
+
+from ..checkpoint.load import LoadedPolicy
+from ..configuration_pi05_geometry import PI05GeometryConfig
+from ..data.images import prepare_images
+from ..geometry.keys import CALIBRATION_PREFIX, DEPTH_SUFFIX, IMAGE_PREFIX, extrinsics_key
+from ..inference.runner import ChunkRunner, Observation
+from ..model.segments import GeometryTokens
+
+PARTS = ("prompt and state", "geometry features", "vision and text", "prefix", "geometry", "denoising", "actions out")
+_LARGE = 0.3  # share of the time from which on a part is worth advice
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds: median and 95th percentile."""
+
+    p50: float
+    p95: float
+
+
+@dataclass(frozen=True)
+class BenchResult:
+    """Timings of a whole prediction by the configured way and by the plain path, of its parts, and what to change."""
+
+    chunk: Timing
+    plain: Timing
+    parts: dict[str, Timing]
+    explanation: dict[str, str]
+    peak_bytes: int | None
+    advice: list[str]
+
+
+def random_observation(config: PI05GeometryConfig, task: str = "do the task") -> dict[str, Any]:
+    """An observation of one sample with the shapes that a checkpoint expects: noise for images, a wall 1 m away for depth."""
+    random = torch.Generator().manual_seed(0)
+    observation: dict[str, Any] = {"task": [task]}
+    for key, feature in {**(config.input_features or {}), **config.geometry_features}.items():
+        shape = (1, *feature.shape)
+        if key.startswith(CALIBRATION_PREFIX):
+            observation[key] = torch.eye(4)[None]
+        elif key.startswith(IMAGE_PREFIX) and key.endswith(DEPTH_SUFFIX):
+            observation[key] = torch.full(shape, 1000.0 if config.depth_unit == "mm" else 1.0)
+        elif feature.type is FeatureType.VISUAL:
+            observation[key] = torch.rand(shape, generator=random)
+        elif key == OBS_STATE:
+            observation[key] = torch.zeros(shape)
+    for camera, calibration in config.calibration.items():
+        if calibration.extrinsics is None and f"{IMAGE_PREFIX}{camera}{DEPTH_SUFFIX}" in observation:
+            observation.setdefault(extrinsics_key(camera), torch.eye(4)[None])
+    return observation
+
+
+@torch.inference_mode()
+def bench(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int = 20) -> BenchResult:
+    """Time predictions from one observation, after two that warm up.
+
+    Raises ValueError for less than one round.
+    """
+    if rounds < 1:
+        raise ValueError(f"rounds must be at least 1, got {rounds}.")
+    policy, device = loaded.policy, str(loaded.policy.config.device)
+    policy.eval()
+    _reset_peak(device)
+
+    def predict(**how: Any) -> None:
+        chunk = policy.predict_action_chunk(loaded.preprocess(dict(observation)), **how)
+        loaded.postprocess(chunk[:, 0])
+
+    chunk = _time(predict, rounds, device)
+    peak = torch.cuda.max_memory_allocated() if device.startswith("cuda") else None
+    plain = _time(lambda: predict(runner="plain"), rounds, device)
+    explanation = policy.sampler.explain(policy.config.inference_runner)  # type: ignore[arg-type]
+    parts = _parts(loaded, observation, rounds, device) if explanation["runner"] == "active" else {}
+    fewer = max(1, policy.config.num_inference_steps // 2)
+    halved = _time(lambda: predict(num_steps=fewer), rounds, device)
+    return BenchResult(
+        chunk, plain, parts, explanation, peak, _advice(policy.config, chunk, halved, fewer, parts, explanation)
+    )
+
+
+def _parts(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int, device: str) -> dict[str, Timing]:
+    """The same prediction, step by step, so on a GPU without graphs: its parts take longer than the whole."""
+    policy = loaded.policy
+    config, runner = policy.config, ChunkRunner(policy.model)
+    in_prefix = policy.model.geometry_in_prefix
+    times: dict[str, list[float]] = {part: [] for part in PARTS}
+    noise = torch.randn(1, config.chunk_size, config.max_action_dim).to(device)
+
+    def step(part: str, run: Callable[[], Any]) -> Any:
+        _synchronise(device)
+        start = time.perf_counter()
+        result = run()
+        _synchronise(device)
+        times[part].append(1e3 * (time.perf_counter() - start))
+        return result
+
+    def measure(batch: dict[str, Any]) -> GeometryTokens | None:
+        return None if policy.geometry is None else policy.geometry(batch)
+
+    def embed(batch: dict[str, Any], tokens: GeometryTokens | None) -> Any:
+        images, masks = prepare_images(batch, config, torch.device(device))
+        text = (batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK])
+        return runner.embed(Observation(images, masks, *text), tokens if in_prefix else None)
+
+    width = config.action_feature.shape[0]
+    for _ in range(rounds + 2):
+        batch = step("prompt and state", partial(loaded.preprocess, dict(observation)))
+        tokens = step("geometry features", partial(measure, batch))
+        prefix = step("vision and text", partial(embed, batch, tokens))
+        own = None if in_prefix else tokens  # a segment of its own
+        room = (0 if own is None else own.pad.shape[1], config.chunk_size)
+        context = step("prefix", partial(runner.prefill, prefix, room))
+        pad = step("geometry", partial(runner.prefill_geometry, context, own))
+        actions = step("denoising", partial(runner.denoise, context, noise, pad, config.num_inference_steps))
+        step("actions out", partial(loaded.postprocess, actions[:, 0, :width]))
+    return {part: _timing(values[2:]) for part, values in times.items()}
+
+
+def _advice(
+    config: PI05GeometryConfig,
+    chunk: Timing,
+    halved: Timing,
+    fewer: int,
+    parts: dict[str, Timing],
+    explanation: dict[str, str],
+) -> list[str]:
+    """What would make it faster, the largest part first; only what follows from the measurement."""
+    advice = []
+    if explanation["runner"] != "active":
+        advice.append(f"The runner is off ({explanation['runner']}): see to that first.")
+    whole = sum(part.p50 for part in parts.values())
+    large = {name: part.p50 / whole for name, part in parts.items() if part.p50 > _LARGE * whole}
+    cameras = len(config.image_features)
+    for name, share in sorted(large.items(), key=lambda item: -item[1]):
+        if name == "denoising" and fewer < config.num_inference_steps:
+            advice.append(
+                f"Denoising takes {share:.0%}: with {fewer} steps instead of {config.num_inference_steps} a chunk took "
+                f"{halved.p50:.1f} ms instead of {chunk.p50:.1f} (--policy.num_inference_steps; check that actions stay good)."
+            )
+        if name in ("vision and text", "prefix") and cameras > 1:
+            advice.append(f"{name.capitalize()} takes {share:.0%} for {cameras} cameras: it grows with each.")
+        if name == "geometry features":
+            advice.append(
+                f"What measures geometry takes {share:.0%}: a smaller encoder or image size, or depth from a camera."
+            )
+        if name == "prompt and state":
+            advice.append(f"Tokenising and normalising take {share:.0%}: the network is small beside them.")
+    if config.dtype == "float32" and config.paligemma_variant == "gemma_2b":
+        advice.append(
+            "Products are computed in float32: --policy.dtype=bfloat16 (and param_dtype=bfloat16) halves what is read."
+        )
+    if config.n_action_steps < config.chunk_size // 2:
+        advice.append(
+            f"Only {config.n_action_steps} of {config.chunk_size} predicted actions are used per chunk: "
+            "a larger --policy.n_action_steps predicts less often."
+        )
+    return advice
+
+
+def _time(run: Callable[[], Any], rounds: int, device: str) -> Timing:
+    values = []
+    for _ in range(rounds + 2):
+        _synchronise(device)
+        start = time.perf_counter()
+        run()
+        _synchronise(device)
+        values.append(1e3 * (time.perf_counter() - start))
+    return _timing(values[2:])
+
+
+def _timing(values: list[float]) -> Timing:
+    ordered = sorted(values)
+    return Timing(statistics.median(values), ordered[min(len(ordered) - 1, round(0.95 * len(ordered)))])
+
+
+def _synchronise(device: str) -> None:
+    if device.startswith("cuda"):
+        torch.cuda.synchronize()
+
+
+def _reset_peak(device: str) -> None:
+    if device.startswith("cuda"):
+        torch.cuda.reset_peak_memory_stats()

@@ -1,0 +1,22 @@
+"""Image augmentation and precomputed features exclude each other."""
+
+from lerobot.configs.train import TrainPipelineConfig
+
+from ..configuration_pi05_geometry import PI05GeometryConfig
+
+
+def refuse_augmentation(training: TrainPipelineConfig) -> None:
+    """Raise ValueError for training that changes images of which it has the features already.
+
+    Only commands that see LeRobot's whole configuration can ask; the policy cannot.
+    """
+    policy = training.policy
+    if (
+        isinstance(policy, PI05GeometryConfig)
+        and policy.geometry_source == "features"
+        and training.dataset.image_transforms.enable
+    ):
+        raise ValueError(
+            "geometry_source=features holds features of the images as they are, so they cannot be augmented: set "
+            "--dataset.image_transforms.enable=false, or train with --policy.geometry_source=da3."
+        )

@@ -1,0 +1,1 @@
+"""How the policy is trained: optimisers, micro-batches, LoRA, sharding."""

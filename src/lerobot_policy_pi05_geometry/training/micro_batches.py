@@ -1,0 +1,143 @@
+"""A training batch with the memory of a part of it: gradients of one micro-batch after the other, inside one loss.
+
+LeRobot's loop calls forward, backward and the optimiser once per batch. So the gradients of the micro-batches are computed
+in the forward pass, where each micro-batch's activations are freed before the next begins, and an autograd function whose
+inputs are the trainable parameters hands the sums over in the backward pass. To whatever stands around it (DDP, gradient
+clipping, a loss scale) that is an ordinary loss: each parameter gets its gradient once per step.
+
+A loss per sample has weights that are known in the backward pass only. There, micro-batches run forward without a graph
+first and again in the backward pass: one forward pass more.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.distributed.fsdp import FullyShardedDataParallel
+from torch.distributed.tensor import DTensor
+
+from ..geometry.keys import CALIBRATION_PREFIX
+
+Part = Callable[[], Tensor]  # computes the loss of one micro-batch, with its graph
+
+
+def sum_of(parts: Sequence[Part], parameters: Sequence[nn.Parameter]) -> Tensor:
+    """Sum of scalar losses, whose gradients by `parameters` are computed now."""
+    total: Tensor = _GradientsInForward.apply(parts, *parameters)
+    return total
+
+
+def each_of(parts: Sequence[Part], parameters: Sequence[nn.Parameter]) -> Tensor:
+    """Losses per sample (B,), put together from the parts' (b,); gradients by `parameters` are computed when asked for."""
+    losses: Tensor = _GradientsInBackward.apply(parts, *parameters)
+    return losses
+
+
+def rows_of(batch: Mapping[str, Any], size: int, rows: slice) -> dict[str, Any]:
+    """Those rows of a batch of `size` samples; what belongs to the whole batch stays as it is."""
+
+    def per_sample(key: str, value: Any) -> bool:
+        if isinstance(value, Tensor):
+            pose_of_all = key.startswith(CALIBRATION_PREFIX) and value.ndim == 2  # (4, 4), once for the batch
+            return value.ndim > 0 and value.shape[0] == size and not pose_of_all
+        return isinstance(value, list | tuple) and len(value) == size
+
+    return {key: value[rows] if per_sample(key, value) else value for key, value in batch.items()}
+
+
+def require_whole_parameters(module: nn.Module) -> None:
+    """Raise ValueError if FSDP shards the parameters of `module`: it gathers and reduces them in passes of its own."""
+    sharded = any(isinstance(m, FullyShardedDataParallel) for m in module.modules())
+    if sharded or any(isinstance(p, DTensor) for p in module.parameters()):
+        raise ValueError(
+            "micro_batch_size computes gradients inside the forward pass, which FSDP's sharded parameters do not allow; "
+            "set --policy.micro_batch_size=0 and lower --batch_size, or train with DDP."
+        )
+
+
+class _GradientSums:
+    """Sums of gradients over several backward passes, one buffer per parameter.
+
+    A hook adds each gradient as soon as it is there and lets go of it, so that the sums and all gradients of one pass
+    are never held at once. `torch.autograd.grad` leaves `.grad` and DDP's hooks alone.
+    """
+
+    def __init__(self, parameters: Sequence[Tensor]) -> None:
+        self.parameters = parameters
+        self.sums: list[Tensor | None] = [None] * len(parameters)
+
+    def add(self, outputs: Tensor, weights: Tensor | None = None) -> None:
+        """Add the gradients of `outputs`, a scalar, or (b,) with `weights` (b,)."""
+
+        def take(index: int) -> Callable[[Tensor], Tensor]:
+            def hook(gradient: Tensor) -> Tensor:
+                found = self.sums[index]
+                if found is None:
+                    self.sums[index] = gradient.detach().clone()
+                else:
+                    found.add_(gradient.detach())
+                return gradient.new_zeros(()).expand(gradient.shape)  # what autograd keeps until the pass ends
+
+            return hook
+
+        handles = [parameter.register_hook(take(i)) for i, parameter in enumerate(self.parameters)]
+        try:
+            torch.autograd.grad(outputs, self.parameters, weights, allow_unused=True)
+        finally:
+            for handle in handles:
+                handle.remove()
+
+    def result(self) -> list[Tensor]:
+        """One gradient per parameter, zero where none came: DDP waits for every parameter that the loss hangs on."""
+        found = zip(self.sums, self.parameters, strict=True)
+        return [torch.zeros_like(parameter) if total is None else total for total, parameter in found]
+
+
+class _GradientsInForward(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, parts: Sequence[Part], *parameters: Tensor) -> Tensor:
+        sums = _GradientSums(parameters)
+        losses = []
+        for part in parts:
+            with torch.enable_grad():
+                loss = part()
+            sums.add(loss)
+            losses.append(loss.detach())
+            del loss
+        ctx.gradients = sums.result()
+        return torch.stack(losses).sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, weight: Tensor) -> tuple[Tensor | None, ...]:
+        gradients, ctx.gradients = ctx.gradients, None
+        if gradients is None:
+            raise RuntimeError(
+                "The gradients of a batch in micro-batches are handed over once; call forward again before backward."
+            )
+        for gradient in gradients:
+            gradient.mul_(weight)
+        return None, *gradients
+
+
+class _GradientsInBackward(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, parts: Sequence[Part], *parameters: Tensor) -> Tensor:
+        ctx.parts = parts
+        ctx.save_for_backward(*parameters)
+        losses = [part() for part in parts]
+        ctx.sizes = [len(loss) for loss in losses]
+        return torch.cat(losses)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, weights: Tensor) -> tuple[Tensor | None, ...]:
+        sums = _GradientSums(ctx.saved_tensors)
+        for part, part_weights in zip(ctx.parts, weights.split(ctx.sizes), strict=True):
+            with torch.enable_grad():
+                losses = part()
+            sums.add(losses, part_weights)
+            del losses
+        return None, *sums.result()

@@ -1,0 +1,43 @@
+"""FSDP units of the policy, for a training loop in plain torch (FSDP2, `torch.distributed.fsdp.fully_shard`).
+
+FSDP gathers a unit's parameters in hooks around its `__call__`, so a unit has to be a module that is called: a transformer
+layer, not a whole transformer, whose layers `PaliGemmaWithExpert` runs one by one for three segments. And a unit's
+parameters have one dtype, so modules that stay in float32 are units of their own.
+"""
+
+from typing import Any
+
+from torch import nn
+from torch.distributed.fsdp import fully_shard
+from transformers.models.siglip.modeling_siglip import SiglipEncoderLayer
+
+from ..model.gemma import GemmaLayer
+from ..model.precision import Float32Module
+
+
+def fsdp_units(policy: nn.Module) -> list[nn.Module]:
+    """Modules to shard one by one, inner ones first; the policy itself is the last unit, and not among them."""
+    units: list[nn.Module] = []
+
+    def visit(module: nn.Module) -> None:
+        if isinstance(module, Float32Module | nn.LayerNorm):
+            units.append(module)
+            return
+        for child in module.children():
+            visit(child)
+        if isinstance(module, GemmaLayer | SiglipEncoderLayer):
+            units.append(module)
+
+    visit(policy)
+    return units
+
+
+def shard[P: nn.Module](policy: P, **options: Any) -> P:
+    """Shard a policy in place; options are those of `fully_shard` (mesh, reshard_after_forward, ...).
+
+    Build the optimiser afterwards, and call `policy(batch)`, not `policy.forward(batch)`, which would skip the hooks.
+    """
+    for unit in fsdp_units(policy):
+        fully_shard(unit, **options)
+    fully_shard(policy, **options)
+    return policy

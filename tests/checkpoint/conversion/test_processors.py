@@ -1,0 +1,100 @@
+"""Processors carry over: the same observation becomes the same prompt and state, the same actions come out."""
+
+import json
+
+import pytest
+import torch
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from safetensors.torch import load_file
+
+from lerobot_policy_pi05_geometry import PI05GeometryConfig
+from lerobot_policy_pi05_geometry.checkpoint.conversion import GeometryStart, convert, export
+from tests.entry_points import ACTION_DIM, CHUNK, FRONT_DEPTH, STATE, STATE_DIM, TOKEN_MASK, TOKENS, make_observation
+
+from .sources import lerobot_pipelines, lerobot_policy, write_lerobot
+
+
+def load(folder, config=None, **overrides):
+    """A checkpoint's processors as LeRobot loads them."""
+    return make_pre_post_processors(config or PI05GeometryConfig(device="cpu"), str(folder), **overrides)
+
+
+def observation(size: int, seed: int, spread: float = 2.0):
+    """States within the range of the statistics, where the prompts of both must agree, or beyond."""
+    state = spread * torch.rand(size, STATE_DIM, generator=torch.Generator().manual_seed(seed)) - spread / 2
+    return make_observation(size, seed) | {STATE: state, "action": torch.randn(size, CHUNK, ACTION_DIM)}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_observations_and_actions_become_the_same(seed, converted, tmp_path):
+    before, after = lerobot_pipelines(lerobot_policy(), tmp_path / "tokenizer"), load(converted)
+    batch = observation(1 + seed % 3, seed)
+    theirs, ours = before[0](dict(batch)), after[0](dict(batch))
+    for key in (STATE, "action", FRONT_DEPTH):
+        torch.testing.assert_close(ours[key], theirs[key], rtol=0, atol=0)
+    length = ours[TOKENS].shape[1]  # ours pads to the longest prompt, theirs to the maximum
+    assert length < theirs[TOKENS].shape[1]
+    assert torch.equal(ours[TOKENS], theirs[TOKENS][:, :length])
+    assert torch.equal(ours[TOKEN_MASK], theirs[TOKEN_MASK][:, :length])
+    assert not theirs[TOKEN_MASK][:, length:].any()
+    action = torch.randn(2, ACTION_DIM)
+    torch.testing.assert_close(after[1](action), before[1](action), rtol=0, atol=0)
+
+
+def test_settings_of_steps_carry_over(tmp_path):
+    source = write_lerobot(tmp_path / "source")
+    path = source / "policy_preprocessor.json"
+    pipeline = json.loads(path.read_text())
+    steps = {step["registry_name"]: step for step in pipeline["steps"]}
+    steps["rename_observations_processor"]["config"]["rename_map"] = {"theirs": "ours"}
+    steps["normalizer_processor"]["config"]["eps"] = 0.25
+    steps["tokenizer_processor"]["config"]["max_length"] = 33
+    steps["device_processor"]["config"]["device"] = "cuda"
+    path.write_text(json.dumps(pipeline))
+    convert(source, tmp_path / "output")
+    found, _ = load(tmp_path / "output")
+    by_type = {type(step).__name__: step for step in found.steps}
+    assert by_type["RenameObservationsProcessorStep"].rename_map == {"theirs": "ours"}
+    assert by_type["NormalizerProcessorStep"].eps == 0.25
+    assert by_type["PortableTokenizerProcessorStep"].max_length == 33
+    assert by_type["DeviceProcessorStep"].device == "cpu"
+    assert [step["registry_name"] for step in pipeline["steps"]][:4] == [
+        step._registry_name for step in found.steps[:4]
+    ]
+
+
+def test_the_tokenizer_travels_in_the_checkpoint(converted):
+    """Nothing is looked up by name any more."""
+    path = converted / "policy_preprocessor.json"
+    step = next(s for s in json.loads(path.read_text())["steps"] if s["registry_name"] == "pi05_geometry_tokenizer")
+    assert set(load_file(converted / step["state_file"])) == {"tokenizer.json", "tokenizer_config.json"}
+
+
+def test_a_tokenizer_that_is_not_there_is_named(lerobot_source, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"Tokenizer folder \./nowhere is not there"):
+        convert(lerobot_source, tmp_path / "output", tokenizer="./nowhere")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_new_tokenizer_is_taken(lerobot_source, tmp_path):
+    folder = lerobot_source / "tokenizer_of_the_test"
+    convert(lerobot_source, tmp_path / "output", GeometryStart(source="none"), tokenizer=str(folder))
+    text = (tmp_path / "output" / "policy_preprocessor.json").read_text()
+    assert json.loads(text)["steps"][5]["config"]["tokenizer_name"] == str(folder)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_exported_processors_are_lerobots(seed, converted, tmp_path):
+    export(converted, tmp_path / "output")
+    assert "pi05_geometry" not in (tmp_path / "output" / "policy_preprocessor.json").read_text()
+    tokenizer = {"tokenizer_processor": {"tokenizer_name": str(tmp_path / "output" / "tokenizer")}}
+    found = load(tmp_path / "output", PI05Config(device="cpu"), preprocessor_overrides=tokenizer)
+    expected = lerobot_pipelines(lerobot_policy(), tmp_path / "tokenizer")
+    assert [type(step) for step in found[0].steps] == [type(step) for step in expected[0].steps]
+    batch = observation(2, seed, spread=6.0)
+    theirs, ours = expected[0](dict(batch)), found[0](dict(batch))
+    for key in (STATE, "action", TOKENS, TOKEN_MASK):
+        assert torch.equal(ours[key], theirs[key]), key
+    action = torch.randn(2, ACTION_DIM)
+    assert torch.equal(found[1](action), expected[1](action))

@@ -1,0 +1,61 @@
+"""What the bench says of a checkpoint: every part is timed, and advice follows from what was measured."""
+
+import pytest
+import torch
+
+from lerobot_policy_pi05_geometry.checkpoint.load import LoadedPolicy
+from lerobot_policy_pi05_geometry.inspect.bench import PARTS, bench, random_observation
+from tests.entry_points import CHUNK, make_observation, make_policy, make_processors
+
+
+def load(**changes) -> LoadedPolicy:
+    policy = make_policy(**changes)
+    return LoadedPolicy(policy, *make_processors(policy.config))
+
+
+@pytest.mark.parametrize("geometry_source", ["rgbd", "random", "none"])
+def test_an_observation_is_made_that_the_policy_accepts(geometry_source):
+    loaded = load(geometry_source=geometry_source)
+    batch = loaded.preprocess(random_observation(loaded.policy.config))
+    assert loaded.policy.predict_action_chunk(batch).isfinite().all()
+    if geometry_source == "rgbd":
+        assert loaded.policy._measure(batch)[1].any()  # a wall is seen
+
+
+def test_every_part_is_timed_and_the_parts_are_the_whole():
+    result = bench(load(), make_observation(1), rounds=3)
+    assert tuple(result.parts) == PARTS
+    assert all(0 < part.p50 <= part.p95 for part in result.parts.values())
+    assert 0 < result.chunk.p50 <= result.chunk.p95
+    assert result.plain.p50 > 0
+    assert result.explanation["runner"] == "active"
+
+
+@pytest.mark.parametrize("changes", [{}, {"geometry_placement": "prefix"}, {"geometry_source": "none"}], ids=str)
+def test_parts_give_the_policys_own_actions(changes):
+    """The pieces that are timed are the prediction, not something like it."""
+    loaded, seen = load(**changes), []
+    noise = torch.randn(1, CHUNK, 8, generator=torch.Generator().manual_seed(3))
+    batch = loaded.preprocess(make_observation(1))
+    expected = loaded.postprocess(loaded.policy.predict_action_chunk(batch, noise=noise)[:, 0])
+    loaded.policy.reset()
+    observed = LoadedPolicy(loaded.policy, loaded.preprocess, lambda actions: seen.append(loaded.postprocess(actions)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch, "randn", lambda *_, **__: noise.clone())
+        bench(observed, make_observation(1), rounds=1)
+    assert len(seen) == 4 * 3  # whole, plain, parts and fewer steps, each with two rounds of warming up
+    for actions in seen[:9]:
+        assert torch.allclose(actions, expected, atol=1e-5)
+
+
+def test_advice_follows_from_the_measurement():
+    result = bench(load(n_action_steps=1, geometry_time="denoise"), make_observation(1), rounds=1)
+    assert result.parts == {}
+    assert "The runner is off (declined: geometry_time=denoise" in result.advice[0]
+    assert "Only 1 of 6 predicted actions" in result.advice[-1]
+    assert not any("float32" in sentence for sentence in result.advice)  # of the released size alone
+
+
+def test_no_round_is_no_measurement():
+    with pytest.raises(ValueError, match="rounds must be at least 1, got 0"):
+        bench(load(), make_observation(1), rounds=0)
