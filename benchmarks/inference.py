@@ -36,7 +36,6 @@ from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS, Da3Backbone, Da3
 from lerobot_policy_pi05_geometry.geometry.da3.encoder import store_products_in
 from lerobot_policy_pi05_geometry.inference.cuda_graphs import GraphRunner
 from lerobot_policy_pi05_geometry.inference.layers import run_layers
-from lerobot_policy_pi05_geometry.inference.packed import why_not_packed
 from lerobot_policy_pi05_geometry.inference.runner import Chunk, ChunkRunner, Observation
 from lerobot_policy_pi05_geometry.inference.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.inference.side_stream import PendingGeometry
@@ -45,20 +44,11 @@ from lerobot_policy_pi05_geometry.model.segments import GeometryTokens
 
 EAGER, COMPILED, GEOMETRY, PLAIN = "lerobot", "lerobot compiled", "geometry", "no geometry"
 NO_GRAPHS, OWN_COMPILED, BESIDE, BEFORE = "geometry, no graphs", "geometry, compiled", "da3 beside", "da3 before"
-UNPACKED = "geometry, not packed"
 PAIRS = {
     "beside over before": (BESIDE, BEFORE),
     "graphs over none": (GEOMETRY, NO_GRAPHS),
     "compiled over not": (OWN_COMPILED, GEOMETRY),
-    "packed over not": (GEOMETRY, UNPACKED),
 }
-
-
-class Unpacked(ChunkRunner):
-    """A runner that reads every matrix as it lies."""
-
-    def _pack(self, matrix: Tensor) -> Tensor:
-        return matrix
 
 
 class CompiledWhole(ChunkRunner):
@@ -143,9 +133,6 @@ def chunk_functions(
         PLAIN: sample,
         EAGER: lambda: lerobot.sample_actions(*padded, noise=noise),
     }
-    if why_not_packed(args.device, ours.config.dtype) is None:
-        unpacked = Unpacked(ours)
-        functions[UNPACKED] = lambda: unpacked(*short, noise=noise, geom_embs=tokens)
     if args.device != "cpu" and runner == "fast":
         functions[NO_GRAPHS] = lambda: sample(geom_embs=tokens, runner="eager")
     if args.da3:

@@ -19,9 +19,8 @@ class _LiveTensors(TorchDispatchMode):
         self.known: set[int] = set()
 
     def add(self, tensor: Tensor) -> None:
-        packed = tensor.is_mkldnn  # which has no storage
-        storage = tensor if packed else tensor.untyped_storage()
-        key, size = id(tensor) if packed else storage._cdata, storage.nbytes if packed else storage.nbytes()
+        storage = tensor.untyped_storage()
+        key, size = storage._cdata, storage.nbytes()
         if key not in self.known:
             self.known.add(key)
             self.bytes += size

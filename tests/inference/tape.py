@@ -16,9 +16,8 @@ WAITS = {"_local_scalar_dense", "item", "is_nonzero", "equal", "nonzero", "maske
 
 
 def storages(tree: Any) -> set[int]:
-    """Of all tensors but packed matrices, which have none and are never written to."""
-    tensors = [leaf for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)]
-    return {tensor.untyped_storage()._cdata for tensor in tensors if not tensor.is_mkldnn}
+    """Of all tensors."""
+    return {leaf.untyped_storage()._cdata for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)}
 
 
 class Tape(TorchDispatchMode):

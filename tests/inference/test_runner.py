@@ -124,7 +124,7 @@ def test_joined_matrices_are_the_networks_own_storage(dtype: torch.dtype) -> Non
     runner = ChunkRunner(network)
     assert storage_bytes(network) == before
     matrices = [m for layers in runner._layers.values() for w in layers for m in (w.qkv, w.gate_up)]
-    joined = {m.untyped_storage().data_ptr() for m in matrices if not m.is_mkldnn}
+    joined = {m.untyped_storage().data_ptr() for m in matrices}
     assert joined <= {p.untyped_storage().data_ptr() for p in network.parameters()}
     for name, tensor in network.state_dict().items():
         assert torch.equal(tensor, weights[name]), name
@@ -202,7 +202,7 @@ DTYPES = [(torch.float32, torch.float32), (torch.bfloat16, torch.float32), (torc
     ids=lambda f: f.__name__,
 )
 def test_weights_that_changed_after_building_act(change, dtype: torch.dtype, param_dtype: torch.dtype) -> None:
-    """Joined in place, copied (bf16 over float32) or packed (bf16), stale matrices and modulations never act."""
+    """Joined in place or copied (bf16 over float32), stale matrices and modulations never act."""
     network = build_network(SEGMENT, seed=51, dtype=dtype, param_dtype=param_dtype).eval()
     runner = ChunkRunner(network)
     batch = draw(network, Case(seed=7, batch=2))

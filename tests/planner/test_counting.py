@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,11 +9,8 @@ from torch import nn
 from torch._subclasses import FakeTensorMode
 from torch.distributed._tools.mem_tracker import MemTracker
 
-from lerobot_policy_pi05_geometry.inference.packed import pack, why_not_packed
 from lerobot_policy_pi05_geometry.planner.acting import CountedSide
 from lerobot_policy_pi05_geometry.planner.counting import MemoryCounter, MemorySplit, storage_bytes
-
-NOT_HERE = why_not_packed("cpu", torch.bfloat16)
 
 
 def mlp(widths: list[int]) -> nn.Sequential:
@@ -73,13 +69,6 @@ def test_labels_move_bytes_and_make_none():
         c = torch.empty(1)
     assert counter.peak == MemorySplit(cache=40, gradients=80, activations=4)
     assert storage_bytes([a, a[1:], b, c], 64) == 64 + 128 + 64
-
-
-@pytest.mark.skipif(NOT_HERE is not None, reason=f"needs a CPU and a PyTorch that pack: {NOT_HERE}")
-def test_a_packed_matrix_that_two_segments_share_counts_once():
-    matrix = torch.zeros(16, 24, dtype=torch.bfloat16)
-    packed = pack(matrix, 5)
-    assert storage_bytes([packed, matrix, packed]) == 2 * matrix.nbytes
 
 
 def test_what_comes_in_a_named_stretch_has_that_name():

@@ -6,12 +6,12 @@
 
 Where a weight is stored in the compute dtype already, the network's own parameters become views of the large matrix: nothing
 is held twice, and what changes the one in place changes the other. Otherwise (bf16 compute over float32 storage) the large
-matrices are copies, and so is what is packed (packed.py); `Weights.stale` tells when the network has moved on.
+matrices are copies; `Weights.stale` tells when the network has moved on.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -20,7 +20,6 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from ..model.gemma import GemmaLayer, GemmaModel, RMSNorm
 
-_JOINED = ("q_proj", "k_proj", "v_proj", "gate_proj", "up_proj")
 _DONE: Counter[str] = Counter()  # "steps" of any optimiser of this process
 
 
@@ -66,15 +65,10 @@ def _fuse_layer(layer: nn.Module, dtype: torch.dtype) -> FusedLayer:
     )
 
 
-def pack_joined(layer: FusedLayer, pack: Callable[[Tensor], Tensor]) -> FusedLayer:
-    """The same with its joined matrices packed; the other two would gain less for their memory."""
-    return replace(layer, qkv=pack(layer.qkv), gate_up=pack(layer.gate_up))
-
-
-def copied(model: GemmaModel, dtype: torch.dtype, packed: bool) -> list[Tensor]:
-    """The weights of which the runner has copies: those of another dtype, and the joined ones if they are packed."""
-    linears = ((name, m.weight) for name, m in model.layers.named_modules() if type(m) is nn.Linear)
-    return [w.detach() for name, w in linears if w.dtype != dtype or (packed and name.endswith(_JOINED))]
+def copied(model: GemmaModel, dtype: torch.dtype) -> list[Tensor]:
+    """The weights of which the runner has copies: those of another dtype."""
+    weights = (module.weight.detach() for module in model.layers.modules() if type(module) is nn.Linear)
+    return [weight for weight in weights if weight.dtype != dtype]
 
 
 def _norm_weight(norm: nn.Module) -> Tensor | None:

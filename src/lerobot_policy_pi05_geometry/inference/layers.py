@@ -14,7 +14,6 @@ from ..model.gemma import RMS_EPS
 from ..model.segment_cache import SegmentKVCache
 from ..model.variants import GemmaVariant
 from .fused_weights import FusedLayer
-from .packed import linear
 
 
 class Modulation(NamedTuple):
@@ -72,10 +71,10 @@ def run_layers(
         attend = _attend_in_products if frame.written_out else F.scaled_dot_product_attention
         attended = attend(queries, seen_keys, seen_values, frame.masks[index])  # (B, KV, H / KV * N, D)
         heads = attended.unflatten(2, (-1, x.shape[1])).flatten(1, 2)  # (B, H, N, D)
-        update = linear(heads.transpose(1, 2).flatten(2), weights.out)
+        update = F.linear(heads.transpose(1, 2).flatten(2), weights.out)
         x = _add(x, update, modulation, 0)
-        gate, up = linear(_norm(x, weights.post_norm, modulation, 1), weights.gate_up).chunk(2, dim=-1)
-        x = _add(x, linear(F.gelu(gate, approximate="tanh").mul_(up), weights.down), modulation, 1)
+        gate, up = F.linear(_norm(x, weights.post_norm, modulation, 1), weights.gate_up).chunk(2, dim=-1)
+        x = _add(x, F.linear(F.gelu(gate, approximate="tanh").mul_(up), weights.down), modulation, 1)
     return x
 
 
@@ -94,7 +93,7 @@ def _attention_inputs(
     kv = variant.num_kv_heads
     heads = 0 if keys_only else variant.num_heads
     first = variant.num_heads * variant.head_dim if keys_only else 0
-    projected = linear(_norm(x, weights.norm, modulation, 0), weights.qkv, first)
+    projected = F.linear(_norm(x, weights.norm, modulation, 0), weights.qkv[first:])
     projected = projected.unflatten(-1, (-1, variant.head_dim)).transpose(1, 2)  # (B, heads + 2 KV, N, D)
     turned = _rotate(projected[:, : heads + kv], frame.cos, frame.sin)
     keys[:, :, span].copy_(turned[:, heads:])

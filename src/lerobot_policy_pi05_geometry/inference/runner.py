@@ -30,9 +30,8 @@ from ..model.precision import Float32Linear, compute_in
 from ..model.segment_cache import SegmentKVCache
 from ..model.segment_mask import segment_mask
 from ..model.segments import GeometryTokens, Segment, SegmentTokens, one_block, segment_positions
-from .fused_weights import FusedLayer, Weights, copied, fuse, pack_joined
+from .fused_weights import FusedLayer, Weights, copied, fuse
 from .layers import LayerModulation, Modulation, SegmentFrame, adaptive_norm, run_layers, write_attention_out
-from .packed import pack, why_not_packed
 from .side_stream import PendingGeometry, SideStream
 
 
@@ -93,14 +92,11 @@ class ChunkRunner:
         network, dtype = self.network.paligemma_with_expert, self.config.dtype
         self.device = self.network.action_in_proj.weight.device
         models = {segment: network.segment_model(segment) for segment in Segment}
-        packs = why_not_packed(self.kernels, dtype) is None
         fused: dict[int, list[FusedLayer]] = {}
         read: list[Tensor] = []
         for model in {id(model): model for model in models.values()}.values():
-            packed = packs and model is models[Segment.SUFFIX]  # whose weights are read at every denoising step
-            layers = fuse(model, dtype)
-            fused[id(model)] = [pack_joined(layer, self._pack) for layer in layers] if packed else layers
-            read += copied(model, dtype, packed)
+            fused[id(model)] = fuse(model, dtype)
+            read += copied(model, dtype)
         self._models = models
         self._layers = {segment: fused[id(model)] for segment, model in models.items()}
         self._side = SideStream(self.device)
@@ -109,9 +105,6 @@ class ChunkRunner:
             linears = [module for module in self.network.modules() if isinstance(module, Float32Linear)]
             read += [parameter.detach() for linear in linears for parameter in linear.parameters()]
         self._weights = Weights(self.network, read)
-
-    def _pack(self, matrix: Tensor) -> Tensor:
-        return pack(matrix, self.config.chunk_size)
 
     def tensors(self) -> list[Tensor]:
         """All that is kept between chunks; some of it is the network's own storage (fused_weights.py)."""

@@ -11,7 +11,6 @@ from ..model.pi05 import PI05Pytorch
 from .cuda_graphs import PROMPT_STEP, GraphRunner
 from .fused_weights import NotPlainError
 from .layers import write_attention_out
-from .packed import why_not_packed
 from .runner import ChunkRunner, why_not
 from .side_stream import PendingGeometry
 
@@ -101,17 +100,12 @@ class ChunkSampler:
             for layer in network.paligemma_with_expert.expert.layers
         )
         written_out = write_attention_out(self._device.type, network.config.dtype)
-        not_packed = why_not_packed(self._device.type, network.config.dtype)
-        packing = "the expert's joined matrices, in copies that are compared before every chunk"
-        if not_packed is not None:
-            packing = f"declined: {not_packed}"
         return {
             "runner": "active",
             "matrices": "joined (q, k, v; gate, up), "
             + (
                 "in the network's own storage" if shared else "copies in the compute dtype, compared before every chunk"
             ),
-            "packing": packing,
             "flow time": "modulations of all denoising steps computed at once, "
             + ("until weights change" if self._device.type == "cpu" else "in every chunk"),
             "attention": "written-out products (measured: faster on a CPU in bf16)" if written_out else "SDPA",

@@ -45,10 +45,6 @@ class CountedRunner(ChunkRunner):
         if self._graphs:
             self._side = CountedSide(self._counter)
 
-    def _pack(self, matrix: Tensor) -> Tensor:
-        """As large as the matrix; packing itself is for real values."""
-        return matrix.clone()
-
     def refresh(self) -> None:
         """Nothing: there are no values to compare, and no weight changes while one chunk is planned."""
 

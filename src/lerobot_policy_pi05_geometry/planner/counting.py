@@ -108,12 +108,7 @@ class MemoryCounter(TorchDispatchMode):
 
 
 def storage_bytes(tensors: Iterable[Tensor], block: int = 1) -> int:
-    """Bytes of the distinct storages of these tensors, each rounded up to `block`; a packed matrix is one by itself."""
-    distinct: dict[int, int] = {}
-    for tensor in tensors:
-        if tensor.is_mkldnn:
-            distinct[id(tensor)] = tensor.nbytes
-        else:
-            storage = tensor.untyped_storage()
-            distinct[storage._cdata] = storage.nbytes()
+    """Bytes of the distinct storages of these tensors, each rounded up to `block`."""
+    storages = [tensor.untyped_storage() for tensor in tensors]
+    distinct = {storage._cdata: storage.nbytes() for storage in storages}
     return sum(-(-size // block) * block for size in distinct.values())
