@@ -1,12 +1,12 @@
-"""Held-out loss against training time, for some values of one training option, side by side in one run.
+"""Held-out loss against training time, for several values of one training option, in one run.
 
     python -m benchmarks.learning --vary flow_samples 1 2 4 8
     python -m benchmarks.learning --vary optimizer adamw adamw8bit
 
-A small policy with a depth camera learns the demo's task from the scripted expert (recorded on first use to `--data`). Every
-value is trained from the same seeds, in one process, a few steps in turn, at a constant learning rate after a short warm-up,
-so that a loss means the same wherever the curve is cut. The loss is measured on episodes that are not trained on, with the
-same noise and flow times for all. Time is the process's CPU time of training alone, so what else the machine does matters little.
+A small policy with a depth camera is trained on the demo's task from scripted experts (recorded on first use to `--data`). Every
+value is trained from the same seeds in one process, a few steps in turn, at a constant learning rate after a short warm-up, so
+that losses at equal steps are comparable. The loss is measured on held-out episodes, with the same noise and flow times for
+all values. Time is the process's CPU time of training only, so other load on the machine has little effect.
 """
 
 import argparse
@@ -40,7 +40,7 @@ EVALUATION_SAMPLES = 4  # flow samples per held-out frame
 
 @dataclass
 class Learner:
-    """One policy in training, and its curve: CPU seconds of training and held-out loss, from step 0 on."""
+    """One policy in training, and its curve: (CPU seconds of training, held-out loss) from step 0 on."""
 
     value: str
     seed: int
@@ -75,7 +75,7 @@ class Learner:
 
 @contextmanager
 def _flow_samples(policy: PI05GeometryPolicy, count: int) -> Iterator[None]:
-    """The same draws for every value of the option."""
+    """Evaluate with a fixed number of flow samples, whatever the option's value."""
     trained_with, policy.config.flow_samples = policy.config.flow_samples, count
     try:
         yield
@@ -91,7 +91,7 @@ def dataset(root: Path, episodes: list[int] | None, fps: int) -> FramesInMemory:
 
 
 def endless(frames: FramesInMemory, batch_size: int, seed: int) -> Iterator[dict]:
-    """Batches in the seed's own order, for ever."""
+    """Shuffled batches without end; the seed determines the order."""
     order = torch.Generator().manual_seed(seed)
     while True:
         yield from DataLoader(frames, batch_size=batch_size, shuffle=True, drop_last=True, generator=order)
@@ -122,7 +122,7 @@ def make_learner(args: argparse.Namespace, value: str, seed: int, frames: Frames
 
 
 def seconds_to(curve: list[tuple[float, float]], loss: float) -> float | None:
-    """CPU seconds until a curve has first come down to a loss, on straight lines between its points; None if never."""
+    """CPU seconds until a curve first reaches a loss, with linear interpolation between its points; None if never."""
     for (t0, l0), (t1, l1) in itertools.pairwise(curve):
         if l1 <= loss:
             return t1 if l0 <= loss else t0 + (t1 - t0) * (l0 - loss) / (l0 - l1)
@@ -130,32 +130,32 @@ def seconds_to(curve: list[tuple[float, float]], loss: float) -> float | None:
 
 
 def table(learners: list[Learner], steps: int) -> dict[str, dict]:
-    """Per value: held-out loss at the end (mean and spread over seeds), and time, over the first value's of the same seed."""
+    """Per value: final held-out loss (mean and standard deviation over seeds), and time relative to the first value's."""
     values = list(dict.fromkeys(learner.value for learner in learners))
     first = {learner.seed: learner for learner in learners if learner.value == values[0]}
     rows = {}
     for value in values:
-        mine = [learner for learner in learners if learner.value == value]
-        last = [learner.curve[-1][1] for learner in mine]
-        reached = [seconds_to(learner.curve, first[learner.seed].curve[-1][1]) for learner in mine]
-        whole = [first[learner.seed].seconds for learner in mine]
+        of_value = [learner for learner in learners if learner.value == value]
+        last = [learner.curve[-1][1] for learner in of_value]
+        reached = [seconds_to(learner.curve, first[learner.seed].curve[-1][1]) for learner in of_value]
+        whole = [first[learner.seed].seconds for learner in of_value]
         times = [r / w for r, w in zip(reached, whole, strict=True) if r is not None]
         rows[value] = {
             "loss": statistics.mean(last),
             "spread": statistics.stdev(last) if len(last) > 1 else None,
-            "difference": statistics.mean(x.curve[-1][1] - first[x.seed].curve[-1][1] for x in mine),
-            "step_ms": 1e3 * statistics.mean(learner.seconds for learner in mine) / steps,
-            "step_ratio": statistics.mean(x.seconds / w for x, w in zip(mine, whole, strict=True)),
+            "difference": statistics.mean(x.curve[-1][1] - first[x.seed].curve[-1][1] for x in of_value),
+            "step_ms": 1e3 * statistics.mean(learner.seconds for learner in of_value) / steps,
+            "step_ratio": statistics.mean(x.seconds / w for x, w in zip(of_value, whole, strict=True)),
             "reached": len(times),
             "time_to_same_loss": statistics.mean(times) if times else None,
-            "curves": {learner.seed: learner.curve for learner in mine},
+            "curves": {learner.seed: learner.curve for learner in of_value},
         }
     return rows
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--vary", nargs="+", required=True, metavar=("OPTION", "VALUE"), help="a field of the policy's")
+    parser.add_argument("--vary", nargs="+", required=True, metavar=("OPTION", "VALUE"), help="a policy option")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--evaluate-every", type=int, default=50)
@@ -164,7 +164,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=5e-4)
     parser.add_argument("--variant", default="small")
     parser.add_argument("--data", type=Path, default=Path("outputs/learning_data"))
-    parser.add_argument("--output", type=Path, help="write numbers and curves to this JSON file")
+    parser.add_argument("--output", type=Path, help="JSON file for results and curves")
     args = parser.parse_args()
 
     if not args.data.exists():

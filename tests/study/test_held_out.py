@@ -77,8 +77,8 @@ def test_what_cannot_be_studied_is_named(root, tmp_path):
         return held_out_runs(tmp_path, folder, "local/mine", arms, [0], {}, 4, held_out, 3)
 
     assert view_conditions(root, "local/mine") == [ALL_CAMERAS, NO_DEPTH]
-    assert runs()[0].own_conditions() == [ALL_CAMERAS, NO_DEPTH]
-    assert runs(arms=("rgb",))[0].own_conditions() == [ALL_CAMERAS]
+    assert runs()[0].distinct_conditions() == [ALL_CAMERAS, NO_DEPTH]
+    assert runs(arms=("rgb",))[0].distinct_conditions() == [ALL_CAMERAS]
     with pytest.raises(FileNotFoundError, match="holds no LeRobotDataset"):
         runs(folder=tmp_path)
     with pytest.raises(ValueError, match="only the simulator has"):

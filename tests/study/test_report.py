@@ -1,8 +1,8 @@
-"""The sentence that a study's report begins with."""
+"""The first sentence of a study's report."""
 
 import pandas as pd
 
-from lerobot_policy_pi05_geometry.study.report import answer
+from lerobot_policy_pi05_geometry.study.report import headline
 
 
 def table(rates: dict[tuple[str, str], int], condition: str = "outside") -> pd.DataFrame:
@@ -17,9 +17,9 @@ def table(rates: dict[tuple[str, str], int], condition: str = "outside") -> pd.D
     return pd.DataFrame(rows, columns=columns)
 
 
-def test_an_arm_on_some_tasks_is_set_beside_geometry_on_these():
+def test_an_arm_on_some_tasks_is_compared_with_geometry_on_these():
     """Pooled over all tasks, a control that ran on the hard one only would look worse than it is."""
-    found = answer(
+    found = headline(
         table(
             {
                 ("hard", "geometry"): 2,
@@ -35,28 +35,28 @@ def test_an_arm_on_some_tasks_is_set_beside_geometry_on_these():
     assert "geometry succeeds in 60% (" in found
     assert "RGB only in 30% (" in found
     assert "random tokens 10% (on hard, where geometry has 20%)" in found
-    assert "no camera at all 20%" in found
-    assert "no camera at all 20% (on" not in found
+    assert "no camera 20%" in found
+    assert "no camera 20% (on" not in found
 
 
-def test_overlap_and_its_absence_are_said():
+def test_the_headline_states_whether_intervals_overlap():
     def said(geometry: int, rgb: int) -> str:
-        return answer(table({("t", "geometry"): geometry, ("t", "rgb"): rgb}))
+        return headline(table({("t", "geometry"): geometry, ("t", "rgb"): rgb}))
 
     assert "the intervals do not overlap" in said(9, 1)
     assert "the intervals do not overlap" in said(1, 9)
     assert "the intervals overlap" in said(5, 4)
 
 
-def test_the_lead_is_over_tasks_and_knows_training_seeds():
+def test_the_difference_is_averaged_over_tasks_and_resamples_training_seeds():
     rows = table({("a", "geometry"): 9, ("a", "rgb"): 1, ("b", "geometry"): 6, ("b", "rgb"): 4, ("c", "geometry"): 0})
-    assert "Were training seeds drawn anew, the lead of +50 points would be +" in answer(rows)
+    assert "The difference is +50 points (+" in headline(rows)
     lucky = rows[rows["training_seed"] == 0]
-    assert "drawn anew" not in answer(lucky)
+    assert "bootstrap over training seeds" not in headline(lucky)
     lost = rows[rows["training_seed"] == 1].assign(success=False)  # one seed in which nobody succeeds
-    assert "the lead of +25 points would be +0 to" in answer(pd.concat([lucky, lost]))
+    assert "The difference is +25 points (+0 to" in headline(pd.concat([lucky, lost]))
 
 
-def test_without_the_camera_moved_the_best_cell_is_named():
-    found = answer(table({("t", "geometry"): 3, ("t", "rgb"): 7}, condition="inside"))
+def test_without_the_outside_condition_the_best_cell_is_named():
+    found = headline(table({("t", "geometry"): 3, ("t", "rgb"): 7}, condition="inside"))
     assert "The best cell of this study is rgb under 'inside': 70%" in found

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from lerobot_policy_pi05_geometry.study.arms import ARMS
-from lerobot_policy_pi05_geometry.study.conditions import CONDITIONS, counts_as
+from lerobot_policy_pi05_geometry.study.conditions import CONDITIONS, equivalent_condition
 from lerobot_policy_pi05_geometry.study.simulated import from_json, runs_of
 from lerobot_policy_pi05_geometry.study.spec import STUDIES, Budget, read_spec
 
@@ -76,8 +76,8 @@ def test_what_several_blocks_ask_of_an_arm_adds_up(tmp_path):
         (("rgb", "rbg"), "no arm 'rbg'"),
         (("noise", "nosie"), "no condition 'nosie'"),
         (("topdown-wide", "topdown-wid"), "no simulated task"),
-        (("steps", "stpes"), "stpes, which means nothing"),
-        (("[[compare]]", "[[compares]]"), "compares, which means nothing"),
+        (("steps", "stpes"), "unknown entries stpes"),
+        (("[[compare]]", "[[compares]]"), "unknown entries compares"),
         (('arms = ["rgb", "geometry"]', ""), "has no arms"),
         (("seeds = [3, 4]", ""), "at least one training seed"),
         (("seeds = [3, 4]", "seeds = [3,, 4]"), "not valid TOML"),
@@ -106,6 +106,6 @@ def test_a_run_is_kept_by_what_it_depends_on(tmp_path):
 
 def test_conditions_of_the_depth_sensor_are_not_evaluated_for_arms_without_depth():
     for name, condition in CONDITIONS.items():
-        assert counts_as(name, depth=True) == name
-        shown = CONDITIONS[counts_as(name, depth=False)]
+        assert equivalent_condition(name, depth=True) == name
+        shown = CONDITIONS[equivalent_condition(name, depth=False)]
         assert (shown.cameras, shown.sensor) == (condition.cameras, "ideal")

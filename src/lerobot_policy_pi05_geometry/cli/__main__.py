@@ -1,11 +1,11 @@
-"""The `pi05-geometry` command: its entry point. The commands stand beside it, one file per topic."""
+"""Entry point of the `pi05-geometry` command."""
 
 import logging
 import os
 import sys
 import warnings
 
-os.environ.setdefault("TQDM_DISABLE", "1")  # LeRobot's bars would draw over ours
+os.environ.setdefault("TQDM_DISABLE", "1")  # LeRobot's bars would overwrite ours
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
 
 from rich.logging import RichHandler
@@ -15,7 +15,7 @@ from . import app, console
 
 
 def main() -> None:
-    """Entry point: errors of the user's input are one sentence, not a traceback."""
+    """Run the application. An error in the user's input is printed as one sentence, without a traceback."""
     logging.basicConfig(
         level=logging.WARNING, format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
     )

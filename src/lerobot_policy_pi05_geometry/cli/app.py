@@ -1,4 +1,4 @@
-"""What all commands share: the application, the console, progress bars, and options that several have."""
+"""The application, its console, progress bars, and options shared by several commands."""
 
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +23,7 @@ Cameras = Annotated[str, typer.Option(help="Range of camera poses: fixed, train,
 Sensor = Annotated[str, typer.Option(help="Depth sensor: ideal, noisy, off, calibration-1, -2 or -5.")]
 
 
-def bars() -> Progress:
+def progress_bars() -> Progress:
     return Progress(
         TextColumn("{task.description:<48}"),
         BarColumn(bar_width=30),

@@ -1,4 +1,4 @@
-"""Commands on a checkpoint: inspect, bench, convert, export, merge."""
+"""The commands on a checkpoint: inspect, bench, convert, export, merge."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,11 +13,11 @@ def inspect(
     checkpoint: Annotated[str, typer.Argument(help="Checkpoint folder (pretrained_model) or hub id.")],
     dataset_root: Annotated[Path, typer.Option("--dataset.root", help="Folder of a LeRobotDataset.")],
     dataset_repo_id: Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")] = "local/dataset",
-    frame: Annotated[int, typer.Option(help="Which frame of the dataset to look at.")] = 0,
-    device: Annotated[str, typer.Option(help="Where the policy runs.")] = "cpu",
+    frame: Annotated[int, typer.Option(help="Index of the frame.")] = 0,
+    device: Annotated[str, typer.Option(help="Device of the policy.")] = "cpu",
     output: Output = Path("inspect.html"),
 ) -> None:
-    """Pictures of a checkpoint on a frame of a dataset: attention layout, depth with grid cells, where actions look."""
+    """Figures of a checkpoint on a dataset frame: attention mask, depth with grid cells, attention of the actions."""
     from ..inspect.inspection import write_inspection
 
     write_inspection(checkpoint, dataset_root, dataset_repo_id, frame, device, output)
@@ -27,14 +27,15 @@ def inspect(
 @app.command()
 def bench(
     checkpoint: Annotated[str, typer.Argument(help="Checkpoint folder (pretrained_model) or hub id.")],
-    device: Annotated[str, typer.Option(help="Where the policy runs.")] = "cpu",
+    device: Annotated[str, typer.Option(help="Device of the policy.")] = "cpu",
     dataset_root: Annotated[
-        Path | None, typer.Option("--dataset.root", help="Take the observation from this dataset; else it is random.")
+        Path | None,
+        typer.Option("--dataset.root", help="Use the first frame of this dataset. Default: a random observation."),
     ] = None,
     dataset_repo_id: Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")] = "local/dataset",
     rounds: Annotated[int, typer.Option(help="Predictions to time.")] = 20,
 ) -> None:
-    """How long a checkpoint takes for an action chunk on this machine, where the time goes, and what would change it."""
+    """Latency of an action chunk of a checkpoint on this machine, of its parts, and advice."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from rich.table import Table
 
@@ -51,7 +52,7 @@ def bench(
         observation = frame_batch(LeRobotDataset(dataset_repo_id, root=dataset_root, depth_output_unit=unit), 0)
     result = run(loaded, observation, rounds)
     table = Table("", "median ms", "95 % ms")
-    rows = {"action chunk": result.chunk, "by the plain path": result.plain} | {
+    rows = {"action chunk": result.chunk, "plain path": result.plain} | {
         f"  {name}": timing for name, timing in result.parts.items()
     }
     for name, timing in rows.items():

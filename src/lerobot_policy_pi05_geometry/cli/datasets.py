@@ -1,4 +1,4 @@
-"""Commands on a dataset: quantiles, precompute."""
+"""The commands on a dataset: quantiles, precompute."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,8 +17,8 @@ def quantiles(
     from ..data.quantiles import write_frame_quantiles
 
     for key, shares in write_frame_quantiles(dataset_root).items():
-        told = " -> ".join(" ".join(f"{share:.0%}" for share in row) for row in shares)
-        console.print(f"{key}: q01 to q99 covers of min to max, per dimension: {told}")
+        text = " -> ".join(" ".join(f"{share:.0%}" for share in row) for row in shares)
+        console.print(f"{key}: q01 to q99 covers of min to max, per dimension: {text}")
 
 
 @app.command()
@@ -32,21 +32,19 @@ def precompute(
     ] = "depth-anything/DA3-BASE",
     grid: Annotated[int, typer.Option(help="Cells per side and camera: the policy's geometry_grid.")] = 8,
     cameras: Annotated[
-        str | None, typer.Option(help="With commas, in token order; every RGB camera, sorted, if left out.")
+        str | None, typer.Option(help="Comma-separated, in token order. Default: every RGB camera, sorted.")
     ] = None,
     image_size: Annotated[int | None, typer.Option(help="Pixels per side: the policy's da3_image_size.")] = None,
-    dtype: Annotated[str, typer.Option(help="What the encoder computes in: bfloat16 or float32.")] = "bfloat16",
+    dtype: Annotated[str, typer.Option(help="Compute dtype of the encoder: bfloat16 or float32.")] = "bfloat16",
     batch_size: Annotated[int, typer.Option(help="Frames per pass of the encoder.")] = 16,
-    device: Annotated[str | None, typer.Option(help="Where the encoder runs; a GPU if there is one.")] = None,
-    output: Annotated[Path | None, typer.Option(help="Folder for stores; the dataset's own if left out.")] = None,
+    device: Annotated[str | None, typer.Option(help="Device of the encoder. Default: a GPU if available.")] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder of the stores. Default: in the dataset's folder.")] = None,
     shard_frames: Annotated[int, typer.Option(help="Frames per file.")] = 512,
-    check: Annotated[
-        bool, typer.Option("--verify", help="Read the finished store, and compare its checksums.")
-    ] = False,
+    check: Annotated[bool, typer.Option("--verify", help="Verify the checksums of a finished store.")] = False,
 ) -> None:
-    """Compute geometry from RGB once: Depth Anything 3's features of every frame, to train with geometry_source=features.
+    """Compute Depth Anything 3's features of every frame once, for training with geometry_source=features.
 
-    Killed and started again it goes on where it stopped. Several processes or machines that share the folder divide the work
+    Started again after an interruption, it continues. Several processes or machines that share the folder divide the frames
     when started with torchrun (`torchrun --nproc-per-node 4 --no-python pi05-geometry precompute ...`).
     """
     from ..precompute.command import run_precompute
@@ -60,8 +58,8 @@ def precompute(
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         console=console,
-    ) as drawn:
+    ) as bars:
         run_precompute(
             dataset_root, dataset_repo_id, encoder, grid, names, image_size, dtype, batch_size, device, output,
-            shard_frames, check, drawn,
+            shard_frames, check, bars,
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The command that says what fits: plan."""
+"""The command plan: predicted memory."""
 
 from typing import Annotated
 
@@ -11,7 +11,7 @@ from .app import app, console
 def plan(
     context: typer.Context,
     gpu: Annotated[
-        str | None, typer.Option(help="Propose what fits it: its memory in GB (24), or a card (h100).")
+        str | None, typer.Option(help="Propose settings that fit this GPU: memory in GB (24), or a model (h100).")
     ] = None,
     batch_size: Annotated[int, typer.Option("--batch_size", help="Samples per training step.", min=1)] = 8,
     cameras: Annotated[int, typer.Option(help="RGB cameras, where no checkpoint names them.", min=0)] = 2,
@@ -22,18 +22,18 @@ def plan(
     ] = None,
     proposals: Annotated[int, typer.Option(help="How many proposals to make.", min=1)] = 3,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Say what was assumed, and why other settings do not fit.")
+        bool, typer.Option("--explain", help="Print the assumptions, and why other settings do not fit.")
     ] = False,
 ) -> None:
-    """Will it fit? Predict peak memory of training and inference, without a GPU and without allocating it.
+    """Predict the peak memory of training and inference, without a GPU and without allocating it.
 
     Settings are given as to lerobot-train: `pi05-geometry plan --policy.dtype=bfloat16 --batch_size=8`,
     `--policy.path=CHECKPOINT` for its own, `--policy.micro_batch_size=2`, `--policy.optimizer=adamw8bit`, `--peft.r=16
     --policy.lora_targets=expert+vlm` for LoRA.
 
-    With --gpu, propose settings that fit, best first: the closest to full fine-tuning (full; all but the vision tower, each with
-    AdamW before 8-bit AdamW; LoRA on VLM and expert; the action expert only; LoRA on the expert), and of each the largest
-    number of samples at once. What you give stays as it is. Exit code 1 if nothing fits.
+    With --gpu, propose settings that fit, closest to full fine-tuning first (full; all but the vision tower, each with AdamW
+    before 8-bit AdamW; LoRA on VLM and expert; the action expert only; LoRA on the expert), each with the largest
+    micro-batch. Options that you give are kept. Exit code 1 if nothing fits.
     """
     from ..planner.command import Data, Wish, run
 
@@ -42,5 +42,5 @@ def plan(
         raise ValueError(f"--image-size is height x width in pixels, as 480x640; got '{image_size}'.")
     data = Data(cameras, depth_cameras, (int(sizes[0]), int(sizes[1])), prompt_tokens)
     wish = Wish(gpu, batch_size, proposals, explain)
-    for shown in run(context.args, data, wish):
-        console.print(shown, soft_wrap=isinstance(shown, str))  # a command to copy is one line
+    for part in run(context.args, data, wish):
+        console.print(part, soft_wrap=isinstance(part, str))  # a command must stay on one line

@@ -1,4 +1,4 @@
-"""Commands of the simulated robot: record, train, evaluate."""
+"""The commands of the simulated robot: record, train, evaluate."""
 
 import sys
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from .app import Cameras, Output, Sensor, Task, app, bars, console, require_simulator
+from .app import Cameras, Output, Sensor, Task, app, console, progress_bars, require_simulator
 
 
 @app.command()
@@ -16,16 +16,16 @@ def record(
     episodes: Annotated[int, typer.Option(help="Successful expert episodes to record.")] = 100,
     cameras: Cameras = "train",
     image_size: Annotated[int, typer.Option(help="Pixels per side of RGB and depth.")] = 84,
-    seed: Annotated[int, typer.Option(help="Another seed records other episodes.")] = 0,
+    seed: Annotated[int, typer.Option(help="Selects the recorded episodes.")] = 0,
 ) -> None:
-    """Record scripted experts into a LeRobotDataset v3 with native depth and calibration."""
+    """Record scripted experts into a LeRobotDataset v3 with depth and calibration."""
     require_simulator()
     from ..sim.record import record as record_episodes
 
-    with bars() as drawn:
-        bar = drawn.add_task("record expert episodes", total=episodes)
+    with progress_bars() as bars:
+        bar = bars.add_task("record expert episodes", total=episodes)
         for done, _ in record_episodes(output, f"local/{output.name}", task, episodes, cameras, image_size, seed=seed):
-            drawn.update(bar, completed=done)
+            bars.update(bar, completed=done)
     console.print(
         f"Train on it: lerobot-train --policy.type=pi05_geometry --dataset.repo_id=local/{output.name} "
         f"--dataset.root={output} ..."
@@ -34,7 +34,7 @@ def record(
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
 def train(context: typer.Context) -> None:
-    """lerobot-train with decoded frames kept in memory; takes its arguments. For datasets that fit."""
+    """lerobot-train, with the same arguments, and decoded frames kept in memory. For small datasets of images."""
     from ..study.frames_in_memory import train_in_memory
 
     sys.argv = ["lerobot-train", *context.args]  # LeRobot parses the command line itself
@@ -48,10 +48,10 @@ def evaluate(
     cameras: Cameras = "train",
     sensor: Sensor = "ideal",
     episodes: Annotated[int, typer.Option(help="Episodes to run.")] = 50,
-    first_seed: Annotated[int, typer.Option(help="Seed of the first episode; the others follow.")] = 0,
-    image_size: Annotated[int, typer.Option(help="Pixels per side; as in training.")] = 84,
+    first_seed: Annotated[int, typer.Option(help="Seed of the first episode; the next ones count up.")] = 0,
+    image_size: Annotated[int, typer.Option(help="Pixels per side, as in training.")] = 84,
     device: Annotated[str, typer.Option(help="Where the policy runs.")] = "cpu",
-    output: Annotated[Path | None, typer.Option(help="Write the outcome of every episode to this JSON file.")] = None,
+    output: Annotated[Path | None, typer.Option(help="JSON file for the outcome of every episode.")] = None,
 ) -> None:
     """Success rate of a checkpoint on a simulated task, with its 95 % interval."""
     import json
@@ -63,9 +63,9 @@ def evaluate(
 
     environment = MetaworldRgbdEnv(task=task, cameras=cameras, sensor=sensor, image_size=image_size)
     loaded = load_policy(checkpoint, device, environment)
-    with bars() as drawn:
-        bar = drawn.add_task(f"{task}, {cameras}", total=episodes)
-        result = run(loaded, environment, episodes, first_seed, progress=lambda done: drawn.update(bar, completed=done))
+    with progress_bars() as bars:
+        bar = bars.add_task(f"{task}, {cameras}", total=episodes)
+        result = run(loaded, environment, episodes, first_seed, progress=lambda done: bars.update(bar, completed=done))
     low, high = result.interval()
     console.print(f"{result.rate:.0%} of {episodes} episodes succeed (95 % interval {low:.0%} to {high:.0%}).")
     if output is not None:

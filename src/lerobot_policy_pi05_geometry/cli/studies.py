@@ -1,4 +1,4 @@
-"""Commands that train and compare: demo, study."""
+"""The commands that train and compare policies: demo, study."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -9,13 +9,13 @@ import typer
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from .app import Output, app, bars, console, require_simulator
+from .app import Output, app, console, progress_bars, require_simulator
 
 if TYPE_CHECKING:
     from ..study.launch import Progress as StudyProgress
     from ..study.runs import Run
 
-Workers = Annotated[int | None, typer.Option(help="Runs at once; one per core if left out.")]
+Workers = Annotated[int | None, typer.Option(help="Runs at once. Default: one per core.")]
 
 
 @app.command()
@@ -25,8 +25,7 @@ def demo(
 ) -> None:
     """Record a simulated RGB-D task, train with and without geometry, evaluate both and a blind floor, write a report.
 
-    Everything happens on this machine's CPU. An interrupted demo goes on where it stopped when it is started again. The
-    report is report.html in the output folder.
+    It runs on the CPU. Started again after an interruption, it continues. The report is report.html in the output folder.
     """
     start = time.monotonic()
     path = _simulated_study("demo", output, workers, retry_crashed=True, command="pi05-geometry demo")
@@ -37,12 +36,12 @@ def demo(
 def study(
     context: typer.Context,
     spec: Annotated[
-        str, typer.Option(help="A study's TOML file, or one that comes along: default, longer, demo, smoke.")
+        str, typer.Option(help="A study's TOML file, or the name of one: default, longer, demo, smoke.")
     ] = "default",
     output: Output = Path("study"),
     workers: Workers = None,
-    smoke: Annotated[bool, typer.Option("--smoke", help="Every step at the smallest size: --spec smoke.")] = False,
-    retry_crashed: Annotated[bool, typer.Option("--retry-crashed", help="Try runs again that crashed before.")] = False,
+    smoke: Annotated[bool, typer.Option("--smoke", help="Every step at the smallest size, as a test.")] = False,
+    retry_crashed: Annotated[bool, typer.Option("--retry-crashed", help="Try crashed runs again.")] = False,
     dataset_root: Annotated[
         Path | None, typer.Option("--dataset.root", help="Your own LeRobotDataset instead of the simulator.")
     ] = None,
@@ -55,16 +54,18 @@ def study(
 ) -> None:
     """Does geometry help? Train and evaluate every arm of a study, and write its report.
 
-    A study is tasks x arms x training seeds x conditions. Killed and started again it goes on where it stopped; finished
-    runs are kept by what they depend on. Over several machines that share the output folder: start it with torchrun on
-    each (`torchrun --nnodes 2 --nproc-per-node 4 --no-python pi05-geometry study --workers 1 ...`).
+    A study is tasks x arms x training seeds x conditions. Started again after an interruption, it continues; finished runs
+    are kept. On several machines that share the output folder, start it with torchrun on each
+    (`torchrun --nnodes 2 --nproc-per-node 4 --no-python pi05-geometry study --workers 1 ...`).
 
-    With --dataset.root it runs on your own data: trained on most episodes, its action error measured on the others. All
-    further options go to lerobot-train (`--policy.dtype=bfloat16 --policy.device=cuda --batch_size=8`).
+    With --dataset.root the study runs on your own dataset: it trains on most episodes and measures the action error on the
+    others. All further options go to lerobot-train (`--policy.dtype=bfloat16 --policy.device=cuda --batch_size=8`).
     """
     if dataset_root is None:
         if context.args:
-            raise ValueError(f"{context.args[0]} is no option of a simulated study; put the budget into a --spec file.")
+            raise ValueError(
+                f"{context.args[0]} is not an option of a simulated study; put the budget into a --spec file."
+            )
         name = "smoke" if smoke else spec
         command = f"pi05-geometry study --spec {name} --output {output}"
         path = _simulated_study(name, output, workers, retry_crashed, command)
@@ -79,7 +80,7 @@ def study(
         )
         if workers is None and options.get("policy.device", "cpu") != "cpu":
             workers = 1  # one run at a time on an accelerator
-        _carry_out(runs, workers, retry_crashed)
+        _execute(runs, workers, retry_crashed)
         command = " ".join(["pi05-geometry study", f"--dataset.root={dataset_root}", *context.args])
         path = write_held_out_report(output, runs, command) if _complete(runs) else None
     if path is not None:
@@ -87,7 +88,7 @@ def study(
 
 
 def _forwarded(arguments: list[str]) -> dict[str, str]:
-    """Options for lerobot-train, as name and value."""
+    """Options for lerobot-train: name -> value."""
     options = {}
     for argument in arguments:
         name, separator, value = argument.removeprefix("--").partition("=")
@@ -98,48 +99,48 @@ def _forwarded(arguments: list[str]) -> dict[str, str]:
 
 
 def _simulated_study(name: str, output: Path, workers: int | None, retry_crashed: bool, command: str) -> Path | None:
-    """Carry out this process's share of a simulated study; write the report if nothing is left to do."""
+    """Execute this rank's share of a simulated study; write the report if all runs are complete."""
     require_simulator()
     from ..study.report import write_report
     from ..study.simulated import runs_of
     from ..study.spec import read_spec
 
     runs = runs_of(read_spec(name), output)
-    _carry_out(runs, workers, retry_crashed)
+    _execute(runs, workers, retry_crashed)
     return write_report(output, runs, command) if _complete(runs) else None
 
 
-def _carry_out(runs: "Sequence[Run]", workers: int | None, retry_crashed: bool) -> None:
+def _execute(runs: "Sequence[Run]", workers: int | None, retry_crashed: bool) -> None:
     from ..study.launch import default_workers, launch, share
 
-    with bars() as shown:
-        launch(share(runs), workers or default_workers(), _study_progress(shown), retry_crashed)
+    with progress_bars() as bars:
+        launch(share(runs), workers or default_workers(), _study_progress(bars), retry_crashed)
 
 
 def _complete(runs: "Sequence[Run]") -> bool:
-    """Whether nothing is left to do; says which runs crashed."""
+    """Whether all runs are complete or crashed; prints the crashed ones."""
     crashed = [run for run in runs if run.crash.exists()]
     for run in crashed:
         console.print(f"[bold red]Crashed[/bold red] {run.name}: see {escape(str(run.log))}", soft_wrap=True)
     if any(run.missing() for run in runs if run not in crashed):
-        console.print("This process's runs are done; the one that finishes last writes the report.")
+        console.print("The runs of this rank are complete; the rank that finishes last writes the report.")
         return False
     return True
 
 
-def _study_progress(drawn: Progress) -> "Callable[[StudyProgress], None]":
-    """A bar for the whole study, and one for each run under way."""
-    whole = drawn.add_task("all runs", total=None)
-    shown: dict[str, TaskID] = {}
+def _study_progress(bars: Progress) -> "Callable[[StudyProgress], None]":
+    """A bar for the whole study, and one for each running job."""
+    whole = bars.add_task("all runs", total=None)
+    task_ids: dict[str, TaskID] = {}
 
     def update(progress: "StudyProgress") -> None:
-        drawn.update(whole, completed=progress.done, total=progress.total)
-        under_way = {job.run.name: job for job in progress.jobs}
-        for name in set(shown) - set(under_way):
-            drawn.remove_task(shown.pop(name))
-        for name, job in under_way.items():
-            if name not in shown:
-                shown[name] = drawn.add_task(name, total=None)
-            drawn.update(shown[name], description=f"{name}: {job.stage}", completed=job.done, total=job.total or None)
+        bars.update(whole, completed=progress.done, total=progress.total)
+        running = {job.run.name: job for job in progress.jobs}
+        for name in set(task_ids) - set(running):
+            bars.remove_task(task_ids.pop(name))
+        for name, job in running.items():
+            if name not in task_ids:
+                task_ids[name] = bars.add_task(name, total=None)
+            bars.update(task_ids[name], description=f"{name}: {job.stage}", completed=job.done, total=job.total or None)
 
     return update

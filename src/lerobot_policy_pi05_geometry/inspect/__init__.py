@@ -1,5 +1,8 @@
-"""Looking inside: what the network attends to, and pictures of it.
+"""Inspection of a checkpoint: attention, figures, latency.
 
-attention   the action tokens' attention, read with forward hooks      pictures   figures of a policy at work
-page        one HTML file that holds its pictures and videos
+```
+   attention    the action tokens' attention, read with forward hooks     pictures   figures
+   inspection   figures of a checkpoint on a dataset frame                page       HTML with embedded figures and videos
+   bench        latency of an action chunk, and of its parts
+```
 """

@@ -1,4 +1,4 @@
-"""Where the action tokens look, read off a policy while it acts."""
+"""Attention of the action tokens, read from a policy with forward hooks."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class SuffixAttention(NamedTuple):
 def suffix_attention(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> SuffixAttention:
     """Predict a chunk and return the attention of its last denoising step.
 
-    Forward hooks see what each layer's attention is given; the policy computes as always.
+    Forward hooks read the inputs of each attention layer and change nothing.
     """
     network = policy.model.paligemma_with_expert
     suffix_length = policy.config.chunk_size
@@ -35,7 +35,7 @@ def suffix_attention(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) ->
     def hook(index: int):
         def record(_: nn.Module, inputs: tuple) -> None:
             q, k, _, mask, bias = inputs
-            # Geometry's own queries see fewer keys.
+            # Geometry's queries have fewer keys.
             if q.shape[2] == suffix_length and k.shape[2] >= total.get(index, 0):
                 total[index] = k.shape[2]
                 seen[index] = attention_weights(q, k, mask, bias).float().mean(dim=(1, 2))
@@ -47,7 +47,9 @@ def suffix_attention(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) ->
         for index, layer in enumerate(network.expert.layers)
     ]
     try:
-        policy.predict_action_chunk(dict(batch), runner="plain")  # the runner has no modules to hook
+        policy.predict_action_chunk(
+            dict(batch), runner="plain"
+        )  # hooks need modules, which the fast runner does not call
     finally:
         for handle in handles:
             handle.remove()
@@ -66,7 +68,7 @@ def suffix_attention(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) ->
 def attention_layout(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> tuple[Tensor, tuple[int, int, int]]:
     """The attention mask as the network applies it to the batch's first sample: (N, N) bool, [query, key], and (P, G, S).
 
-    Collected from the masks that the layers are given in one uncached pass, not drawn from what they should be.
+    Read from the masks that the network is given in one uncached pass.
     """
     network = policy.model.paligemma_with_expert
     rows: list[Tensor] = []

@@ -1,4 +1,4 @@
-"""Where the time of an action chunk goes, for a user's own checkpoint on their own machine, and what would change it."""
+"""Latency of an action chunk of a checkpoint on this machine, of its parts, and advice that follows from it."""
 
 import statistics
 import time
@@ -19,7 +19,7 @@ from ..inference.runner import ChunkRunner, Observation
 from ..model.segments import GeometryTokens
 
 PARTS = ("prompt and state", "geometry features", "vision and text", "prefix", "geometry", "denoising", "actions out")
-_LARGE = 0.3  # share of the time from which on a part is worth advice
+_LARGE = 0.3  # a part with at least this share of the time gets advice
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class BenchResult:
-    """Timings of a whole prediction by the configured way and by the plain path, of its parts, and what to change."""
+    """Timings of a prediction with the configured runner and with the plain path, of its parts, and advice."""
 
     chunk: Timing
     plain: Timing
@@ -43,7 +43,7 @@ class BenchResult:
 
 
 def random_observation(config: PI05GeometryConfig, task: str = "do the task") -> dict[str, Any]:
-    """An observation of one sample with the shapes that a checkpoint expects: noise for images, a wall 1 m away for depth."""
+    """An observation of one sample with the shapes that a checkpoint expects: noise for images, depth 1 m at every pixel."""
     random = torch.Generator().manual_seed(0)
     observation: dict[str, Any] = {"task": [task]}
     for key, feature in {**(config.input_features or {}), **config.geometry_features}.items():
@@ -64,9 +64,9 @@ def random_observation(config: PI05GeometryConfig, task: str = "do the task") ->
 
 @torch.inference_mode()
 def bench(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int = 20) -> BenchResult:
-    """Time predictions from one observation, after two that warm up.
+    """Time predictions from one observation, after two warm-up predictions.
 
-    Raises ValueError for less than one round.
+    Raises ValueError for fewer than one round.
     """
     if rounds < 1:
         raise ValueError(f"rounds must be at least 1, got {rounds}.")
@@ -91,7 +91,7 @@ def bench(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int = 20) -
 
 
 def _parts(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int, device: str) -> dict[str, Timing]:
-    """The same prediction, step by step, so on a GPU without graphs: its parts take longer than the whole."""
+    """The same prediction in parts. On a GPU this is without CUDA graphs, so the parts take longer than the whole."""
     policy = loaded.policy
     config, runner = policy.config, ChunkRunner(policy.model)
     in_prefix = policy.model.geometry_in_prefix
@@ -136,10 +136,10 @@ def _advice(
     parts: dict[str, Timing],
     explanation: dict[str, str],
 ) -> list[str]:
-    """What would make it faster, the largest part first; only what follows from the measurement."""
+    """Advice that follows from the measurement, for the largest part first."""
     advice = []
     if explanation["runner"] != "active":
-        advice.append(f"The runner is off ({explanation['runner']}): see to that first.")
+        advice.append(f"The runner is off ({explanation['runner']}): enable it first.")
     whole = sum(part.p50 for part in parts.values())
     large = {name: part.p50 / whole for name, part in parts.items() if part.p50 > _LARGE * whole}
     cameras = len(config.image_features)
@@ -147,24 +147,24 @@ def _advice(
         if name == "denoising" and fewer < config.num_inference_steps:
             advice.append(
                 f"Denoising takes {share:.0%}: with {fewer} steps instead of {config.num_inference_steps} a chunk took "
-                f"{halved.p50:.1f} ms instead of {chunk.p50:.1f} (--policy.num_inference_steps; check that actions stay good)."
+                f"{halved.p50:.1f} ms instead of {chunk.p50:.1f} (--policy.num_inference_steps; check the success rate)."
             )
         if name in ("vision and text", "prefix") and cameras > 1:
             advice.append(f"{name.capitalize()} takes {share:.0%} for {cameras} cameras: it grows with each.")
         if name == "geometry features":
             advice.append(
-                f"What measures geometry takes {share:.0%}: a smaller encoder or image size, or depth from a camera."
+                f"Geometry features take {share:.0%}: use a smaller encoder or image size, or a depth camera."
             )
         if name == "prompt and state":
-            advice.append(f"Tokenising and normalising take {share:.0%}: the network is small beside them.")
+            advice.append(f"Tokenising and normalising take {share:.0%}: the network is small in comparison.")
     if config.dtype == "float32" and config.paligemma_variant == "gemma_2b":
         advice.append(
-            "Products are computed in float32: --policy.dtype=bfloat16 (and param_dtype=bfloat16) halves what is read."
+            "Matrix products are computed in float32: --policy.dtype=bfloat16 (and param_dtype=bfloat16) halves memory traffic."
         )
     if config.n_action_steps < config.chunk_size // 2:
         advice.append(
             f"Only {config.n_action_steps} of {config.chunk_size} predicted actions are used per chunk: "
-            "a larger --policy.n_action_steps predicts less often."
+            "a larger --policy.n_action_steps needs fewer predictions."
         )
     return advice
 

@@ -1,4 +1,4 @@
-"""The same pictures for any checkpoint and dataset."""
+"""Figures of a checkpoint on a frame of a dataset."""
 
 from pathlib import Path
 
@@ -11,27 +11,29 @@ from .pictures import depth_figure, layout_figure, segment_share_figure
 
 
 def write_inspection(checkpoint: str, root: Path, repo_id: str, frame: int, device: str, output: Path) -> None:
-    """Write a page about one frame of a dataset, seen by a checkpoint.
+    """Write a page about one frame of a dataset, processed by a checkpoint.
 
-    Raises ValueError for a frame that is not there or a checkpoint of another policy.
+    Raises ValueError for a frame outside the dataset or a checkpoint of another policy.
     """
     if not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(
-            f"{root} is no LeRobotDataset: it has no meta/info.json; give --dataset.root its folder."
+            f"{root} is no LeRobotDataset: it has no meta/info.json; give the dataset's folder with --dataset.root."
         )
     loaded = load_policy(checkpoint, device)
     policy = loaded.policy
     dataset = LeRobotDataset(repo_id, root=root, depth_output_unit=policy.config.depth_unit)
     if not 0 <= frame < len(dataset):
-        raise ValueError(f"The dataset has frames 0 to {len(dataset) - 1}, there is no frame {frame}.")
+        raise ValueError(f"The dataset has frames 0 to {len(dataset) - 1}; there is no frame {frame}.")
     batch = loaded.preprocess(frame_batch(dataset, frame))
     page = Page(f"{Path(checkpoint).name} on frame {frame} of {root.name}")
     page.lead(f"Task: {dataset[frame]['task']}")
     if policy.geometry is not None and policy.config.geometry_source == "rgbd":
-        page.row(picture(depth_figure(policy, batch), "Depth with its grid cells, and where the action tokens look."))
+        page.row(
+            picture(depth_figure(policy, batch), "Depth with its grid cells, and the attention of the action tokens.")
+        )
     page.row(
         picture(layout_figure(policy, batch), "The attention mask as the network applied it."),
-        picture(segment_share_figure(policy, batch), "What the action tokens attend to, layer by layer."),
+        picture(segment_share_figure(policy, batch), "Attention of the action tokens per segment and layer."),
     )
     page.write(output)
 

@@ -1,4 +1,4 @@
-"""One HTML file that holds its pictures and videos, so that it can be mailed."""
+"""One HTML file with embedded figures and videos."""
 
 import base64
 import html
@@ -30,7 +30,7 @@ class Page:
         self._parts = [f"<h1>{html.escape(title)}</h1>"]
 
     def lead(self, text: str) -> None:
-        """The first sentence, which says what came out."""
+        """The first sentence: the result."""
         self._parts.append(f'<p class="lead">{html.escape(text)}</p>')
 
     def heading(self, text: str) -> None:
@@ -52,7 +52,7 @@ class Page:
         self._parts.append(f'<div class="row">{"".join(figures)}</div>')
 
     def write(self, path: Path) -> None:
-        """Write the page, whole or not at all."""
+        """Write the page atomically."""
         content = (
             f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(self._title)}</title>'
             f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style>'

@@ -1,4 +1,4 @@
-"""Figures of a policy at work. Each function returns a matplotlib figure; nothing is drawn from what should be."""
+"""Figures. Each function returns a matplotlib figure of measured values."""
 
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ SEGMENT_NAMES = ("prefix", "geometry", "suffix")
 
 
 def layout_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Figure:
-    """The attention mask of the batch's first sample, coloured by the segment that is looked at."""
+    """The attention mask of the batch's first sample, coloured by the segment of the key."""
     mask, lengths = attention_layout(policy, batch)
     column_segment = np.repeat(np.arange(3), lengths)
     image = np.where(mask.cpu().numpy(), column_segment[None] + 1, 0)
@@ -42,14 +42,14 @@ def layout_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Fi
     labels = [f"{SEGMENT_NAMES[i]} ({lengths[i]})" for i in shown]
     axes.set_xticks(centres, labels)
     axes.set_yticks(centres, labels, rotation=90, va="center")
-    axes.set_xlabel("key: what is looked at (white columns: padding and holes)")
-    axes.set_ylabel("query: who looks")
+    axes.set_xlabel("key (white columns: padding and holes)")
+    axes.set_ylabel("query")
     axes.set_title("Attention mask, as the network applied it")
     return figure
 
 
 def depth_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Figure:
-    """Per depth camera: RGB, depth with its grid cells, and where the action tokens look in it."""
+    """Per depth camera: RGB, depth with its grid cells, and the attention of the action tokens on the cells."""
     source = policy.geometry.source
     attention = suffix_attention(policy, batch)
     prefix, geometry, _ = attention.lengths
@@ -68,7 +68,7 @@ def depth_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Fig
             shown[:] = np.where(valid[0, 0].numpy(), depth[0, 0].numpy(), np.nan)
         if rgb is not None:
             row[0].imshow(rgb)
-        row[0].set_title(f"{camera}: RGB, what the VLM sees")
+        row[0].set_title(f"{camera}: RGB, input of the VLM")
         drawn = row[1].imshow(shown, cmap="viridis_r")
         figure.colorbar(drawn, ax=row[1], label="metres", shrink=0.8)
         _grid_lines(row[1], shown.shape, grid)
@@ -82,7 +82,7 @@ def depth_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Fig
                 heat, cmap="magma", alpha=0.6, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest"
             )
             figure.colorbar(drawn, ax=row[2], label="attention", shrink=0.8)
-        row[2].set_title("where the action tokens look")
+        row[2].set_title("attention of the action tokens")
     for ax in axes.flat:
         ax.set_xticks([])
         ax.set_yticks([])
@@ -90,7 +90,7 @@ def depth_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Fig
 
 
 def segment_share_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Figure:
-    """How much of the action tokens' attention goes to each segment, layer by layer."""
+    """Share of the action tokens' attention per segment and layer."""
     attention = suffix_attention(policy, batch)
     ends = np.cumsum((0, *attention.lengths))
     per_layer = attention.per_layer.mean(dim=1).cpu().numpy()  # (layers, keys)

@@ -1,12 +1,12 @@
-"""A simulated RGB-D robot: Meta-World tasks seen by a calibrated camera that stands elsewhere in every episode.
+"""A simulated RGB-D robot: Meta-World tasks observed by a calibrated camera whose pose changes with every episode.
 
 ```
-   cameras         where the camera may stand, and what MuJoCo's camera is in OpenCV terms
-   tasks           which tasks, in which ranges, in which words
-   sensor          a depth camera's faults and a wrong calibration, on purpose
-   environment     the gymnasium environment            configuration   its LeRobot registration, `metaworld_rgbd`
-   record          scripted experts -> LeRobotDataset       evaluate        a checkpoint on seeds it never saw
+   cameras         ranges of camera poses; MuJoCo's camera in OpenCV's convention
+   tasks           tasks: object ranges and instructions
+   sensor          simulated faults of a depth camera and of its calibration
+   environment     the gymnasium environment                configuration   its LeRobot registration, `metaworld_rgbd`
+   record          scripted experts -> LeRobotDataset       evaluate        success rate of a checkpoint
 ```
 
-Nothing here is imported before it is needed: the package registers the environment without MuJoCo being installed.
+MuJoCo is imported on first use only: the package registers the environment even if MuJoCo is not installed.
 """

@@ -1,4 +1,4 @@
-"""Where the simulated camera may stand, and MuJoCo's camera in OpenCV terms."""
+"""Ranges of simulated camera poses, and MuJoCo's camera in OpenCV's convention."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from ..geometry.camera import CameraCalibration
 from .headless import mujoco
 
 LOOK_AT = (0.0, 0.72, 0.08)  # metres, robot base frame: the middle of the table
-BASE_AZIMUTH = 225.0  # degrees; from here the arm does not stand in front of the object
+BASE_AZIMUTH = 225.0  # degrees; at this azimuth the arm does not occlude the object
 Interval = tuple[float, float]
 
 
@@ -17,8 +17,8 @@ Interval = tuple[float, float]
 class CameraRange:
     """Camera poses on a sphere around `LOOK_AT`.
 
-    azimuth: intervals of offsets from `BASE_AZIMUTH`, degrees, drawn from in proportion to their length. elevation:
-    degrees, negative looks down. distance: metres.
+    azimuth: intervals of offsets from `BASE_AZIMUTH`, degrees; an interval is drawn in proportion to its length.
+    elevation: degrees, negative looks down. distance: metres.
     """
 
     azimuth: tuple[Interval, ...]
@@ -57,7 +57,7 @@ def intrinsics(model: mujoco.MjModel, size: int) -> CameraCalibration:
 def extrinsics(scene: mujoco.MjvScene) -> np.ndarray:
     """`base_T_camera`, (4, 4) float32, of the camera that a scene was last updated with.
 
-    MuJoCo renders in stereo: the view stands midway between its two cameras.
+    MuJoCo renders in stereo: the camera centre is midway between its two cameras.
     """
     left, right = scene.camera
     forward = np.asarray(left.forward, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The environment as LeRobot knows it: `--env.type=metaworld_rgbd`."""
+"""The environment's LeRobot configuration: `--env.type=metaworld_rgbd`."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,10 +14,10 @@ from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
 @EnvConfig.register_subclass("metaworld_rgbd")
 @dataclass
 class MetaworldRgbdEnv(EnvConfig):
-    """A Meta-World task seen by an RGB-D camera (see environment.py).
+    """A Meta-World task observed by an RGB-D camera (see environment.py).
 
-    task: of sim/tasks.py. cameras: range of camera poses, of sim/cameras.py. sensor: what the depth camera does to its
-    measurements, of sim/sensor.py. image_size: pixels per side.
+    task: of sim/tasks.py. cameras: range of camera poses, of sim/cameras.py. sensor: depth sensor, of
+    sim/sensor.py. image_size: pixels per side.
     """
 
     task: str | None = "button-press-topdown-wide"
@@ -72,7 +72,7 @@ class MetaworldRgbdEnv(EnvConfig):
 
 
 def require_simulator() -> None:
-    """Raise ModuleNotFoundError, saying what to do, unless MuJoCo, Meta-World and an EGL library are there."""
+    """Raise ModuleNotFoundError with installation advice unless MuJoCo, Meta-World and an EGL library are available."""
     try:
         from . import headless  # noqa: F401  MuJoCo first: Meta-World imports it too
 

@@ -1,4 +1,4 @@
-"""The gymnasium environment: a Meta-World task seen by one calibrated RGB-D camera."""
+"""The gymnasium environment: a Meta-World task observed by one calibrated RGB-D camera."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ DEPTH_KEY = f"images.{CAMERA}_depth"
 EXTRINSICS_KEY = f"calibration.{CAMERA}.extrinsics"
 ACTION_REPEAT = 4  # simulator steps (1/80 s) per control step
 FPS = 20
-MAX_DEPTH_MM = 10_000  # beyond, a depth camera measures nothing: stored as 0
+MAX_DEPTH_MM = 10_000  # larger depth counts as not measured: stored as 0
 STATE_NAMES = ["hand.x", "hand.y", "hand.z", "gripper"]
 ACTION_NAMES = ["hand.dx", "hand.dy", "hand.dz", "gripper"]
 _SLOW_RENDERING = (
@@ -27,9 +27,9 @@ _SLOW_RENDERING = (
 
 
 class RgbdMetaworldEnv(gym.Env):
-    """A task whose object and camera stand elsewhere in every episode, both drawn from the reset seed.
+    """A task whose object and camera poses are drawn from the reset seed.
 
-    Observation: `pixels.front` (S, S, 3) uint8; `images.front_depth` (S, S, 1) float32 millimetres, 0 where nothing is
+    Observation: `pixels.front` (S, S, 3) uint8; `images.front_depth` (S, S, 1) float32 millimetres, 0 where not
     measured; `calibration.front.extrinsics` (4, 4) float32, base_T_camera; `agent_pos` (4,) hand position in metres and
     gripper opening. Action (4,) in [-1, 1]: hand displacement and gripper effort. An episode ends with success.
     """
@@ -64,23 +64,23 @@ class RgbdMetaworldEnv(gym.Env):
             }
         )
         self.action_space = gym.spaces.Box(-1.0, 1.0, (4,), np.float32)
-        self._simulator: Any = None  # built on first use, so that worker processes get a rendering context of their own
+        self._simulator: Any = None  # built on first use, so that each worker process has its own rendering context
 
     def _start(self) -> None:
         simulator = make_simulator(self._spec)
-        simulator.model.vis.quality.offsamples = 0  # with multisampling off, software rendering is ten times as fast
+        simulator.model.vis.quality.offsamples = 0  # without multisampling, software rendering is ten times as fast
         self._renderer = mujoco.Renderer(simulator.model, self.image_size, self.image_size)
         self.calibration = {CAMERA: intrinsics(simulator.model, self.image_size)}
-        self._simulator = simulator  # last: an environment whose renderer did not start has nothing to close
+        self._simulator = simulator  # last, so that close() does nothing if the renderer did not start
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
         super().reset(seed=seed)
         if self._simulator is None:
             self._start()
-        # Meta-World ignores `reset(seed=)`; its own `seed` decides where the object stands.
+        # Meta-World ignores `reset(seed=)`; its own `seed` determines the object's pose.
         self._simulator.seed(int(self.np_random.integers(2**31)))
         self._camera = self._range.draw(self.np_random)
-        # Drawn last and apart, so that the same seed shows the same scene to every sensor.
+        # Drawn last and from a separate generator: the same seed gives the same scene for every sensor.
         self._sensor_random = np.random.default_rng(int(self.np_random.integers(2**31)))
         self._pose_error = self._sensor.draw_pose_error(self._sensor_random)
         self.simulator_state, _ = self._simulator.reset()
@@ -125,7 +125,7 @@ class RgbdMetaworldEnv(gym.Env):
         return pixels, depth
 
     def render(self) -> np.ndarray:
-        """What the camera last saw, enlarged for videos."""
+        """The last RGB image, enlarged four times for videos."""
         return self._pixels.repeat(4, axis=0).repeat(4, axis=1)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A checkpoint in the simulator: which seeds it succeeds on, and what it looked like."""
+"""A checkpoint in the simulator: success per seed, and frames of some episodes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ CONFIDENCE = 0.95
 
 @dataclass
 class Evaluation:
-    """Outcome per seed, and frames of the first episodes, (steps, H, W, 3) uint8 each."""
+    """Outcome per seed, and frames of the first episodes, each (steps, H, W, 3) uint8."""
 
     seeds: list[int] = field(default_factory=list)
     successes: list[bool] = field(default_factory=list)
@@ -37,7 +37,7 @@ class Evaluation:
         return float(interval.low), float(interval.high)
 
     def save(self, path: Path) -> None:
-        """Write outcomes and videos to one file, whole or not at all."""
+        """Write outcomes and videos to one file, atomically."""
         unfinished = path.with_suffix(".unfinished.npz")
         videos = {f"video_{i}": video for i, video in enumerate(self.videos)}
         np.savez_compressed(unfinished, seeds=self.seeds, successes=self.successes, steps=self.steps, **videos)  # type: ignore[arg-type]
@@ -75,9 +75,9 @@ def evaluate(
 ) -> Evaluation:
     """Run `episodes` episodes on the seeds first_seed, first_seed + 1, ...
 
-    The noise that the policy starts from is drawn per batch of seeds, so that an evaluation repeats exactly.
-    parallel: episodes stepped together. videos: how many of the first episodes to keep frames of. progress: called with
-    the number of episodes done.
+    The sampler's noise is seeded per batch of episodes, so that an evaluation is reproducible. parallel: episodes stepped
+    together. videos: number of first episodes whose frames are kept. progress: called with the number of finished
+    episodes.
     """
     result = Evaluation()
     parallel = min(parallel, episodes)
@@ -102,7 +102,7 @@ def evaluate(
 def _rollout(
     loaded: LoadedPolicy, vector: Any, seeds: list[int], keep_frames: bool
 ) -> tuple[np.ndarray, np.ndarray, list]:
-    """One batch of episodes to their ends: success and number of steps per episode, and all frames."""
+    """Run one batch of episodes to their ends: success and number of steps per episode, and all frames."""
     loaded.policy.reset()
     observation, _ = vector.reset(seed=seeds, options={NEW_ROLLOUT_OPTION: True})
     done = np.zeros(len(seeds), dtype=bool)

@@ -1,4 +1,4 @@
-"""MuJoCo, told to render without a display. It chooses its OpenGL when it is first imported, so import it from here."""
+"""MuJoCo with rendering without a display. It selects its OpenGL on its first import, so import it from here."""
 
 import os
 

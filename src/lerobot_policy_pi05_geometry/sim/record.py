@@ -1,4 +1,4 @@
-"""Scripted experts -> a LeRobotDataset v3 with native depth."""
+"""Scripted experts -> a LeRobotDataset v3 with LeRobot's depth maps."""
 
 import logging
 import shutil
@@ -16,12 +16,12 @@ from .tasks import make_expert
 
 logger = logging.getLogger(__name__)
 
-# Recording seeds start here, evaluation seeds at 0: an evaluated episode is never one that was trained on.
+# Recording seeds start here, evaluation seeds at 0, so no training episode is evaluated.
 FIRST_SEED = 1_000_000
 
 
 def dataset_features(image_size: int) -> dict[str, dict]:
-    """LeRobot's description of what is recorded."""
+    """LeRobot features of a recording."""
     axes = ["height", "width", "channels"]
     depth = {"dtype": "image", "shape": (image_size, image_size, 1), "names": axes, "info": {"is_depth_map": True}}
     return {
@@ -43,20 +43,20 @@ def record(
     action_noise: float = 0.3,
     seed: int = 0,
 ) -> Iterator[tuple[int, bool]]:
-    """Record `episodes` successful expert episodes; failed ones are dropped and tried again with another seed.
+    """Record `episodes` successful expert episodes; failed attempts are dropped and another seed is tried.
 
-    root: folder of the new dataset; it appears only once all episodes are in it. task: of tasks.py. cameras: range of
-    camera poses. action_noise: standard deviation of the noise in what is executed; what is recorded is the expert's
-    own action, so that the data shows how to come back (DART, Laskey et al., 2017).
+    root: folder of the new dataset; it exists only after all episodes are written. task: of tasks.py. cameras: range of
+    camera poses. action_noise: standard deviation of the noise in executed actions; the recorded action is the
+    expert's without noise, so that the data contains corrections (DART, Laskey et al., 2017).
 
     Yields (episodes recorded so far, whether the last attempt succeeded) after every attempt.
     """
     root = Path(root)
     if root.exists():
-        raise FileExistsError(f"{root} already exists; choose another folder, or remove it to record anew.")
+        raise FileExistsError(f"{root} already exists; choose another folder, or remove it first.")
     unfinished = root.with_name(f".{root.name}.unfinished")
     shutil.rmtree(unfinished, ignore_errors=True)
-    disable_progress_bar()  # one per episode would bury ours
+    disable_progress_bar()  # one bar per episode would hide ours
     environment = RgbdMetaworldEnv(task, cameras, image_size)
     dataset = LeRobotDataset.create(
         repo_id,

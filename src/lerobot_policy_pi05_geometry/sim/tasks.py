@@ -1,7 +1,7 @@
-"""Which tasks, in which ranges, in which words.
+"""Tasks: object ranges and instructions.
 
-All 50 Meta-World v3 tasks work by their own name, in their own ranges. Those ranges are small: a policy that sees
-nothing already succeeds often. The `-wide` tasks move the object farther, so that success means having seen it.
+All 50 Meta-World v3 tasks are available under their own names with their own object ranges. Those ranges are small: a policy
+without a camera often succeeds. The `-wide` tasks have larger ranges, so that success requires observing the object.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """A task: Meta-World's environment, the instruction, and where the object may stand (None: as in Meta-World).
+    """A task: Meta-World's environment, the instruction, and the object's range (None: Meta-World's).
 
     object_range: low and high corner of the reset vector, metres. max_steps: control steps of an episode.
     """
@@ -42,7 +42,7 @@ WIDE_TASKS = {
 
 
 def find_task(name: str) -> TaskSpec:
-    """The task of this name. Raises ValueError with the names there are."""
+    """The task of this name. Raises ValueError that lists the known names."""
     if name in WIDE_TASKS:
         return WIDE_TASKS[name]
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
@@ -54,12 +54,12 @@ def find_task(name: str) -> TaskSpec:
 
 
 def make_simulator(task: TaskSpec):
-    """Meta-World's environment of a task, fully observable (for its expert) and randomised by its own seed."""
+    """Meta-World's environment of a task, fully observable (for its expert) and seeded."""
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
     simulator = ALL_V3_ENVIRONMENTS[task.environment]()
-    # What `set_task` would do from a pickled task. The observation space is cached while the goal is hidden, and
-    # `step` would clip the goal out of the observation, so that experts which need it fail.
+    # `set_task` does this from a pickled task. The cached observation space was made with a hidden goal: `step` would clip
+    # the goal out of the observation, and experts that need it would fail.
     simulator._set_task_called = True
     simulator._partially_observable = False
     vars(simulator).pop("sawyer_observation_space", None)

@@ -1,6 +1,6 @@
-"""Arms of a study: what a policy sees, and where its geometry enters. Everything else is equal.
+"""Arms of a study: what a policy observes, and where its geometry enters. Everything else is equal.
 
-An arm is a set of `--policy.*` options of lerobot-train on top of the budget's, so that anyone can train it by hand.
+An arm is a set of `--policy.*` options of lerobot-train, added to the budget's. So anyone can train it without a study.
 """
 
 from dataclasses import dataclass, field
@@ -12,8 +12,8 @@ BLIND_INPUTS = '{"observation.state": {"type": "STATE", "shape": [4]}}'
 class Arm:
     """One arm.
 
-    title: for a reader of the report. options: of lerobot-train, without the dashes. cameras: range of camera poses in
-    its training data. depth: whether it reads depth; one that does not sees no difference when the depth sensor fails.
+    title: shown in the report. options: of lerobot-train, without the dashes. cameras: range of camera poses in its
+    training data. depth: whether it reads depth. Faults of the depth sensor do not affect an arm that does not.
     """
 
     title: str
@@ -32,7 +32,7 @@ def _no_depth(title: str, source: str, cameras: str = "train", **options: str) -
 
 
 ARMS = {
-    "blind": _no_depth("no camera at all: the floor", "none", **{"policy.input_features": BLIND_INPUTS}),
+    "blind": _no_depth("no camera: the blind floor", "none", **{"policy.input_features": BLIND_INPUTS}),
     "rgb": _no_depth("RGB only: plain π0.5", "none"),
     "rgb-wide": _no_depth("RGB only, trained on the wide camera range", "none", cameras="wide"),
     "geometry": _geometry("RGB, and a geometry segment from depth: the default"),
@@ -41,7 +41,7 @@ ARMS = {
     "gate-closed": _geometry("gate started almost closed", geometry_gate_init="-8"),
     "flow-time": _geometry("segment conditioned on the current flow time", geometry_time="denoise"),
     "own-expert": _geometry("an expert of its own for geometry", geometry_expert="own"),
-    "dropout": _geometry("geometry left out of half of the training samples, not of a tenth", geometry_dropout="0.5"),
+    "dropout": _geometry("geometry masked in half of the training samples", geometry_dropout="0.5"),
     "parallel": _geometry("parallel positions", geometry_positions="parallel"),
     "camera-frame": _geometry("points in the camera's frame", geometry_frame="camera"),
     "grid-4": _geometry("4 x 4 cells", geometry_grid="4"),
@@ -50,7 +50,7 @@ ARMS = {
 
 
 def find_arm(name: str) -> Arm:
-    """The arm of this name. Raises ValueError with the names there are."""
+    """The arm of this name. Raises ValueError that lists the known names."""
     if name not in ARMS:
-        raise ValueError(f"There is no arm '{name}'; choose of: {', '.join(ARMS)}.")
+        raise ValueError(f"There is no arm '{name}'; choose one of: {', '.join(ARMS)}.")
     return ARMS[name]

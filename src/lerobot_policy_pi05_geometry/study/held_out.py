@@ -1,7 +1,8 @@
-"""A run on a user's own data: trained on some episodes, its action chunks compared with those of the others.
+"""A run on a user's dataset: trained on some episodes, and its action chunks compared with those of the others.
 
-No simulator and no robot: this is open-loop error, not success. A policy may act well along another path than the one that
-was recorded, or fail by small errors that add up. It says whether geometry helps to predict what was done.
+There is no simulator and no robot, so the result is an open-loop error, not a success rate. A policy may act well along
+another path than the recorded one, and small errors may add up to failure. The error measures how well recorded actions are
+predicted.
 """
 
 import json
@@ -23,19 +24,19 @@ from torch.utils.data import default_collate
 from ..checkpoint.load import LoadedPolicy, load_policy
 from ..geometry.keys import DEPTH_SUFFIX, depth_key
 from .arms import find_arm
-from .runs import Run, Say, option_list, versions
+from .runs import ReportProgress, Run, option_list, versions
 from .training import train_with
 
 ALL_CAMERAS, NO_DEPTH, ONLY = "all-cameras", "no-depth", "only-"
-_NOISE_SEED = 0  # every frame's chunk starts from noise of its own, the same for every arm
+_NOISE_SEED = 0  # the noise that a chunk starts from depends on the episode only, so it is the same for every arm
 
 
 @dataclass(frozen=True)
 class HeldOutRun(Run):
     """An arm on a user's dataset.
 
-    dataset_root, repo_id: the dataset. options: the user's own of lerobot-train. held_out: share of each task's episodes
-    that are evaluated and not trained on, the last ones. frames: of each held-out episode that are evaluated, evenly spaced.
+    dataset_root, repo_id: the dataset. options: further options of lerobot-train. held_out: share of each task's
+    episodes, the last ones, for evaluation only. frames: evaluated frames of each held-out episode, evenly spaced.
     """
 
     dataset_root: Path
@@ -70,18 +71,18 @@ class HeldOutRun(Run):
     def evaluation_description(self, condition: str) -> dict[str, Any]:
         return {"condition": condition, "frames": self.frames}
 
-    def own_conditions(self) -> list[str]:
+    def distinct_conditions(self) -> list[str]:
         return list(self.conditions) if self.arm.depth else [ALL_CAMERAS]
 
-    def prepare(self, say: Say) -> None:
-        """The data is the user's, and there."""
+    def prepare(self, report_progress: ReportProgress) -> None:
+        """Nothing to prepare: the dataset exists."""
 
     def train(self, output: Path) -> None:
         videos = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).video_keys
         train_with(self.arguments(output), in_memory=not videos)
 
     def arguments(self, output: Path) -> list[str]:
-        """lerobot-train's arguments; the user's options hold over all but what the study decides."""
+        """lerobot-train's arguments. The arm's options and the study's settings override the user's options."""
         return option_list(
             {
                 "policy.type": "pi05_geometry",
@@ -102,29 +103,31 @@ class HeldOutRun(Run):
         )
 
     def _blind_inputs(self) -> dict[str, str]:
-        """The blind arm's inputs, with the size that this dataset's state has."""
+        """Inputs of the blind arm, with this dataset's state size."""
         if self.arm.options.get("policy.input_features") is None:
             return {}
         features = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).features
         if OBS_STATE not in features:
             raise ValueError(
-                f"{self.dataset_root} has no {OBS_STATE}, so a blind policy would see nothing; leave that arm out."
+                f"{self.dataset_root} has no {OBS_STATE}, so a blind policy has no input; leave that arm out."
             )
         shape = list(features[OBS_STATE]["shape"])
         return {"policy.input_features": json.dumps({OBS_STATE: {"type": "STATE", "shape": shape}})}
 
-    def evaluate(self, condition: str, say: Say) -> None:
+    def evaluate(self, condition: str, report_progress: ReportProgress) -> None:
         config = TrainPipelineConfig.from_pretrained(self.checkpoint)
         _, dataset = make_train_eval_datasets(config)
         assert dataset is not None  # held_out is above 0
         loaded = load_policy(self.checkpoint, str(config.trainable_config.device))
-        errors = action_errors(loaded, dataset, condition, self.frames, lambda done, n: say(condition, done, n))
+        errors = action_errors(
+            loaded, dataset, condition, self.frames, lambda done, n: report_progress(condition, done, n)
+        )
         unfinished = self.folder / "unfinished.npz"
         np.savez_compressed(unfinished, errors=errors)
         unfinished.replace(self.outcome(condition))
 
     def errors(self, condition: str) -> np.ndarray | None:
-        """Mean error per held-out episode, horizon step and action dimension, (E, S, D); None while it is missing."""
+        """Mean error per held-out episode, horizon step and action dimension, (E, S, D); None before evaluation."""
         path = self.outcome(condition if self.arm.depth else ALL_CAMERAS)
         if not path.exists():
             return None
@@ -161,7 +164,7 @@ def held_out_runs(
 ) -> list[HeldOutRun]:
     """Every run of a study on a user's dataset, seed by seed.
 
-    Raises FileNotFoundError or ValueError with one sentence for what cannot be studied.
+    Raises FileNotFoundError if there is no dataset, and ValueError if arms or settings do not fit it.
     """
     if not (dataset_root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{dataset_root} holds no LeRobotDataset (meta/info.json is missing).")
@@ -187,7 +190,7 @@ def held_out_runs(
 
 
 def view_conditions(root: Path, repo_id: str) -> list[str]:
-    """What an arm with depth is shown at evaluation: all depth cameras, each one alone, and none."""
+    """Conditions for an arm with depth: all depth cameras, each one alone, and none."""
     prefix = f"{OBS_IMAGES}."
     keys = LeRobotDatasetMetadata(repo_id, root=root).features
     cameras = sorted(
@@ -195,17 +198,17 @@ def view_conditions(root: Path, repo_id: str) -> list[str]:
         for key in keys
         if key.startswith(prefix) and key.endswith(DEPTH_SUFFIX)
     )
-    alone = [f"{ONLY}{camera}" for camera in cameras] if len(cameras) > 1 else []
-    return [ALL_CAMERAS, *alone, NO_DEPTH] if cameras else [ALL_CAMERAS]
+    single = [f"{ONLY}{camera}" for camera in cameras] if len(cameras) > 1 else []
+    return [ALL_CAMERAS, *single, NO_DEPTH] if cameras else [ALL_CAMERAS]
 
 
 def hide_depth(batch: dict[str, Any], condition: str) -> dict[str, Any]:
-    """The batch with the depth of other cameras than the condition's measuring nothing."""
+    """The batch with the depth of all cameras but the condition's set to zero (no measurement)."""
     if condition == ALL_CAMERAS:
         return batch
-    shown = depth_key(condition.removeprefix(ONLY)) if condition.startswith(ONLY) else None
+    kept = depth_key(condition.removeprefix(ONLY)) if condition.startswith(ONLY) else None
     return {
-        key: torch.zeros_like(value) if key.endswith(DEPTH_SUFFIX) and key != shown else value
+        key: torch.zeros_like(value) if key.endswith(DEPTH_SUFFIX) and key != kept else value
         for key, value in batch.items()
     }
 
@@ -218,7 +221,7 @@ def action_errors(
     frames: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> np.ndarray:
-    """Mean absolute error of predicted actions, in the dataset's units, (E, S, D); NaN where no frame reaches so far.
+    """Mean absolute error of predicted actions, in the dataset's units, (E, S, D); NaN where every episode has ended.
 
     One chunk is predicted at each of `frames` evenly spaced frames of every episode of the dataset.
     """

@@ -1,4 +1,4 @@
-"""The page of a study on a user's own data: action error on held-out episodes, per arm, per camera, per step ahead."""
+"""The report of a study on a user's dataset: action error on held-out episodes, per arm, camera and step ahead."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,8 +21,8 @@ Errors = dict[tuple[str, str], np.ndarray]  # by arm and condition, (training se
 def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str) -> Path:
     """Write report.html, errors.csv, errors.parquet and the pictures; returns the path of the page.
 
-    Errors are in standard deviations of the recorded actions, averaged over action dimensions. A run that crashed has no
-    error to count, so it is named, and its arm is shown without that seed.
+    Errors are in standard deviations of the recorded actions, averaged over action dimensions. A crashed run has no error:
+    it is listed, and its arm is shown without that training seed.
     """
     errors = collect(runs)
     table = errors_table(runs)
@@ -31,20 +31,20 @@ def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str
     pictures = folder / "pictures"
     pictures.mkdir(exist_ok=True)
     page = Page(f"Does geometry help on {runs[0].dataset_root.name}?")
-    page.lead(answer(errors))
+    page.lead(headline(errors))
     seeds, first = len({run.seed for run in runs}), runs[0]
     page.text(
         f"{len(runs)} training runs of {first.steps} steps, {seeds} training seed{'s' if seeds > 1 else ''}; the last "
         f"{first.held_out:.0%} of the episodes were held out. Errors are mean absolute errors of predicted action chunks, in "
-        "standard deviations of the recorded actions (1 is a guess of the mean's size), with 95 % intervals from a "
+        "standard deviations of the recorded actions, with 95 % intervals from a "
         "bootstrap over training seeds and held-out episodes."
     )
     crashed = [run.name for run in runs if run.crash.exists()]
     if crashed:
-        page.text(f"Crashed, and missing from the figures: {', '.join(crashed)}.")
+        page.text(f"Crashed runs, not in the figures: {', '.join(crashed)}.")
     page.text(
         "This is open-loop error, not success: a policy may act well along another path than the recorded one, and small "
-        "errors may add up to failure. Only runs on the robot or in a simulator tell."
+        "errors may add up to failure. Success is measured on the robot or in a simulator."
     )
     conditions = [c for c in runs[0].conditions if any(key[1] == c for key in errors)]
     arms = [arm for arm in ARMS if (arm, ALL_CAMERAS) in errors]
@@ -53,11 +53,11 @@ def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str
         [[arm, ARMS[arm].title, *(_interval(errors[arm, c].mean(axis=2)) for c in conditions)] for arm in arms],
     )
     if "geometry" in arms and len(arms) > 1:
-        page.text("geometry minus each arm on the same episodes; below zero, geometry predicts better.")
+        page.text("Error of geometry minus error of each arm on the same episodes. Negative: geometry predicts better.")
         rows = [[arm, *(_gap(errors, arm, c) for c in conditions)] for arm in arms if arm != "geometry"]
         page.table(["geometry minus", *(_title(c) for c in conditions)], rows)
     bands = {arm: _bands(errors[arm, ALL_CAMERAS]) for arm in arms}
-    caption = "Error of the action so many steps ahead, mean and interval."
+    caption = "Error by number of steps ahead: mean and interval."
     page.row(picture(horizon_figure(bands), caption, pictures / "horizon.png"))
     curves = {
         run.arm_name: read_curve(run.log, run.log_every)
@@ -65,7 +65,7 @@ def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str
         if run.seed == runs[0].seed and not run.crash.exists()
     }
     page.row(picture(curves_figure(curves), "Loss on training batches, first seed.", pictures / "curves.png"))
-    page.heading("Again")
+    page.heading("To repeat this study")
     page.code(command)
     path = folder / "report.html"
     page.write(path)
@@ -73,7 +73,7 @@ def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str
 
 
 def collect(runs: Sequence[HeldOutRun]) -> Errors:
-    """Errors per arm and condition, (training seeds, episodes, S). Raises ValueError for a run that is not complete."""
+    """Errors per arm and condition, (training seeds, episodes, S). Raises ValueError if a run is neither complete nor crashed."""
     found: dict[tuple[str, str], list[np.ndarray]] = {}
     for run in runs:
         if run.crash.exists():
@@ -83,19 +83,19 @@ def collect(runs: Sequence[HeldOutRun]) -> Errors:
             errors = run.errors(condition)
             if errors is None:
                 raise ValueError(
-                    f"Run {run.name} has not been evaluated under '{condition}' yet; let the study finish."
+                    f"Run {run.name} has not been evaluated under '{condition}'; start the study again to complete it."
                 )
             found.setdefault((run.arm_name, condition), []).append(np.nanmean(errors / scale, axis=2))
     if not found:
-        raise ValueError("Every run of the study crashed; see the run.log of each.")
-    return {key: _whole_steps(np.stack(values)) for key, values in found.items()}
+        raise ValueError("Every run of the study crashed; the reason is in each run.log.")
+    return {key: _complete_steps(np.stack(values)) for key, values in found.items()}
 
 
 def errors_table(runs: Sequence[HeldOutRun]) -> pd.DataFrame:
     """One row per run, condition, held-out episode, step ahead and action dimension, in the dataset's units."""
     frames = []
     for run in runs:
-        for condition in run.own_conditions():
+        for condition in run.distinct_conditions():
             errors = None if run.crash.exists() else run.errors(condition)
             if errors is not None:
                 index = pd.MultiIndex.from_product(map(range, errors.shape), names=["episode", "step", "dimension"])
@@ -104,8 +104,8 @@ def errors_table(runs: Sequence[HeldOutRun]) -> pd.DataFrame:
     return pd.concat(frames, ignore_index=True)
 
 
-def answer(errors: Errors) -> str:
-    """What came out, in one sentence, whatever it is."""
+def headline(errors: Errors) -> str:
+    """The result in one sentence."""
     if ("geometry", ALL_CAMERAS) not in errors or ("rgb", ALL_CAMERAS) not in errors:
         arm, _ = min(errors, key=lambda key: errors[key].mean())
         return f"The arm with the smallest error on held-out episodes is {arm}."
@@ -113,11 +113,11 @@ def answer(errors: Errors) -> str:
     means = f"{geometry.mean():.3f} with geometry, {rgb.mean():.3f} with RGB only"
     if geometry.shape != rgb.shape:
         return (
-            f"On held-out episodes the action error is {means}; runs crashed, so the two cannot be compared in pairs."
+            f"On held-out episodes the action error is {means}; runs crashed, so a paired comparison is not possible."
         )
     gap, low, high = bootstrap((geometry - rgb).mean(axis=2))
     if low <= 0 <= high:
-        verdict = "no difference that these episodes can show"
+        verdict = "no significant difference"
     else:
         verdict = "geometry predicts better" if gap < 0 else "geometry predicts worse"
     return f"On held-out episodes the action error is {means}: {verdict} ({gap:+.3f}, {low:+.3f} to {high:+.3f})."
@@ -128,8 +128,8 @@ def _action_spread(run: HeldOutRun) -> np.ndarray:
     return np.asarray(stats[ACTION]["std"], dtype=np.float64).reshape(-1)
 
 
-def _whole_steps(errors: np.ndarray) -> np.ndarray:
-    """Without the steps that lie beyond the end of some episode's frames."""
+def _complete_steps(errors: np.ndarray) -> np.ndarray:
+    """Without steps for which some episode has no frame."""
     return errors[..., ~np.isnan(errors).any(axis=(0, 1))]
 
 
@@ -146,7 +146,7 @@ def _interval(values: np.ndarray) -> str:
 def _gap(errors: Errors, arm: str, condition: str) -> str:
     geometry, other = errors["geometry", condition], errors[arm, condition]
     if geometry.shape != other.shape:
-        return "not in pairs"
+        return "not paired"
     mean, low, high = bootstrap((geometry - other).mean(axis=2))
     return f"{mean:+.3f} ({low:+.3f} to {high:+.3f})"
 

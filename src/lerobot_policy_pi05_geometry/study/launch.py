@@ -1,8 +1,8 @@
-"""Runs of a study, several at once, and over several machines.
+"""Runs of a study: several at once, on one or more machines.
 
-Each run is a process with its own threads: at small sizes two processes of one thread do more than one of two. Under
-torchrun (or any launcher that sets RANK and WORLD_SIZE) every rank takes its share of the runs; the ranks need nothing of
-each other but a folder that all of them see.
+Each run is a process with its own threads: at small sizes two processes of one thread are faster than one of two threads.
+Under torchrun (or any launcher that sets RANK and WORLD_SIZE) every rank executes its share of the runs. Ranks share an
+output folder and do not communicate otherwise.
 """
 
 import json
@@ -18,13 +18,13 @@ from .runs import Run
 from .training_log import TrainingCurve
 from .worker import PROGRESS
 
-_EVALUATION_COST = 2.5  # of an episode or frame, beside a step of training, for the estimate of the time left
-_LAST_WORDS = 2_000  # characters of a crashed run's log that are kept with it
+_EVALUATION_COST = 2.5  # of one episode or frame, in training steps; for the estimate of the remaining time
+_CRASH_LOG_CHARACTERS = 2_000  # kept from the end of a crashed run's log
 
 
 @dataclass
 class Job:
-    """A run that is being carried out: its process, and how far it is."""
+    """A run in execution: its process and its progress."""
 
     run: Run
     process: subprocess.Popen
@@ -35,7 +35,7 @@ class Job:
     total: int = 0
 
     def read_log(self) -> None:
-        """Take note of what the process wrote since the last look."""
+        """Update the progress from the lines that the process has logged since the last call."""
         with self.run.log.open() as log:
             log.seek(self.log_position)
             text = log.read()
@@ -52,7 +52,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a study is: work done and in all (in training steps), the runs under way, and those that crashed."""
+    """Progress of a study: work done and total work (in training steps), running jobs, crashed runs."""
 
     done: float
     total: float
@@ -61,22 +61,22 @@ class Progress:
 
 
 def share(runs: Sequence[Run]) -> list[Run]:
-    """This process's part of the runs: all of them, or every WORLD_SIZE-th."""
+    """The runs of this rank: every WORLD_SIZE-th, or all without a launcher."""
     return list(runs)[int(os.environ.get("RANK", "0")) :: int(os.environ.get("WORLD_SIZE", "1"))]
 
 
 def default_workers() -> int:
-    """Runs at once: one per core, shared with the other ranks on this machine."""
+    """Runs at once: one per core, divided by the number of ranks on this machine."""
     return max(1, (os.cpu_count() or 1) // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 def launch(
     runs: Sequence[Run], workers: int, on_progress: Callable[[Progress], None], retry_crashed: bool = False
 ) -> None:
-    """Carry out every run that is not complete, `workers` at once.
+    """Execute every run that is not complete, `workers` at once.
 
-    A run that crashes is recorded as crashed (`crashed.json` beside its log) and the others go on; it is tried again only
-    if `retry_crashed`. Interrupted, this ends its processes; what they had finished is kept.
+    A run that crashes is recorded (`crashed.json` beside its log) and the others continue. It is tried again only with
+    `retry_crashed`. On an interrupt the processes are terminated; finished parts are kept.
     """
     waiting = deque(run for run in runs if run.missing() and (retry_crashed or not run.crash.exists()))
     threads = max(1, default_workers() // max(1, min(workers, len(waiting))))
@@ -90,7 +90,7 @@ def launch(
                 job.read_log()
                 if job.process.poll() is not None:
                     running.remove(job)
-                    _note_crash(job)
+                    _record_crash(job)
             on_progress(_progress(runs, running))
     finally:
         for job in running:
@@ -111,7 +111,7 @@ def _start(run: Run, threads: int) -> Job:
         "TOKENIZERS_PARALLELISM": "false",
     }
     for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE", "LOCAL_WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"):
-        environment.pop(name, None)  # a worker trains alone; with these, accelerate would wait for the other ranks
+        environment.pop(name, None)  # with these set, accelerate would wait for the other ranks
     with run.log.open("a") as log:
         position = log.tell()
         command = [sys.executable, "-m", "lerobot_policy_pi05_geometry.study.worker", str(description)]
@@ -119,17 +119,17 @@ def _start(run: Run, threads: int) -> Job:
     return Job(run, process, position, TrainingCurve(run.log_every))
 
 
-def _note_crash(job: Job) -> None:
+def _record_crash(job: Job) -> None:
     if job.process.returncode == 0:
         return
-    last_words = job.run.log.read_text()[-_LAST_WORDS:]
-    job.run.crash.write_text(json.dumps({"exit_code": job.process.returncode, "last_words": last_words}, indent=2))
+    log_end = job.run.log.read_text()[-_CRASH_LOG_CHARACTERS:]
+    job.run.crash.write_text(json.dumps({"exit_code": job.process.returncode, "log_end": log_end}, indent=2))
 
 
 def _progress(runs: Sequence[Run], running: Sequence[Job]) -> Progress:
     crashed = [run for run in runs if run.crash.exists()]
-    total = sum(_cost(run, True, run.own_conditions()) for run in runs)
-    # A crashed run will not be carried on: the rest of its work is not left to do.
+    total = sum(_cost(run, True, run.distinct_conditions()) for run in runs)
+    # The remaining work of a crashed run is not done, so it is not counted.
     left = sum(_cost(run, not run.checkpoint.exists(), run.missing()) for run in runs if run not in crashed)
     for job in running:
         if job.stage == "train" and not job.run.checkpoint.exists():

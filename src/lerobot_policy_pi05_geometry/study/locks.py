@@ -1,11 +1,11 @@
-"""One process at a time on what several may want to make."""
+"""Locks between processes that share an output folder."""
 
 from pathlib import Path
 
 from filelock import FileLock
 
 
-def alone(folder: Path) -> FileLock:
-    """A lock for making a folder, to be used in a `with`; it lies beside the folder and ends with its process."""
+def folder_lock(folder: Path) -> FileLock:
+    """A lock for creating a folder, to be used in a `with`. The lock file stands beside it; a killed process releases it."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     return FileLock(folder.with_name(f".{folder.name}.lock"))

@@ -1,4 +1,4 @@
-"""The study's page: the answer first, then the figures that show it, then what they cannot say."""
+"""The report of a simulated study: the result first, then the figures, then the limitations."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from ..inspect.page import Page, picture, video
 from ..inspect.pictures import curves_figure, depth_figure, layout_figure, segment_share_figure, success_figure
 from .arms import ARMS
 from .conditions import CONDITIONS
-from .results import Cell, Versus, cells, comparisons, episodes_table, lead
+from .results import ArmComparison, Cell, cells, comparisons, episodes_table, pooled_difference
 from .simulated import SimulatedRun
 from .training_log import read_curve
 
@@ -24,7 +24,7 @@ _SHOWN_IN_VIDEOS = ("geometry", "rgb", "random")
 def write_report(folder: Path, runs: Sequence[SimulatedRun], command: str) -> Path:
     """Write report.html, episodes.csv, episodes.parquet and the pictures; returns the path of the page.
 
-    command: how the study was started, for the reader who wants to repeat it.
+    command: how the study was started; shown so that a reader can repeat it.
     """
     table = episodes_table(runs)
     table.to_csv(folder / "episodes.csv", index=False)
@@ -33,28 +33,28 @@ def write_report(folder: Path, runs: Sequence[SimulatedRun], command: str) -> Pa
     pictures.mkdir(exist_ok=True)
     found, versus = cells(table), comparisons(table)
     page = Page("Does geometry help?")
-    page.lead(answer(table))
-    _what_was_done(page, runs)
+    page.lead(headline(table))
+    _setup(page, runs)
     for task in dict.fromkeys(run.task for run in runs):
         _task(page, task, [c for c in found if c.task == task], [v for v in versus if v.task == task], runs, pictures)
-    _inside(page, runs, pictures)
-    page.heading("What this cannot say")
+    _trained_policy(page, runs, pictures)
+    page.heading("Limitations")
     page.text(
         "The networks are small and trained from scratch, depth is simulated, the experts are scripted and the tasks are "
-        "few: how much a pretrained π0.5 gains on a real robot is not measured here. Wilson intervals and McNemar's test treat "
-        "all episodes of an arm alike, and so know nothing of how much training seeds differ; the intervals of differences "
-        f"resample them, but there are only {len({run.seed for run in runs})}. A difference whose corrected p is above 0.05 is "
-        "no difference that this study can show."
+        "few. The gain of a pretrained π0.5 on a real robot is not measured here. Wilson intervals and McNemar's test treat "
+        "all episodes of an arm as independent and ignore the variation between training seeds. The intervals of differences "
+        f"resample training seeds, of which there are {len({run.seed for run in runs})}. A difference with a corrected p above "
+        "0.05 is not significant."
     )
-    page.heading("Again, or on your own")
+    page.heading("To repeat this study")
     page.code(command)
     path = folder / "report.html"
     page.write(path)
     return path
 
 
-def answer(table: pd.DataFrame) -> str:
-    """What came out, whatever it is: geometry against RGB only with the camera moved, and how sure that is."""
+def headline(table: pd.DataFrame) -> str:
+    """The result: geometry against RGB only with the camera outside the training range, with intervals."""
     rows = table[table["condition"] == "outside"]
     arms = {cell.arm: cell for cell in cells(rows.assign(task="all"))}
     if "geometry" not in arms or "rgb" not in arms:
@@ -62,28 +62,31 @@ def answer(table: pd.DataFrame) -> str:
         return f"The best cell of this study is {best.arm} under '{best.condition}': {_cell(best)}."
     geometry, rgb = arms["geometry"], arms["rgb"]
     apart = geometry.interval()[0] > rgb.interval()[1] or rgb.interval()[0] > geometry.interval()[1]
-    verdict = "the intervals do not overlap" if apart else "the intervals overlap, so this does not tell them apart"
+    verdict = "the intervals do not overlap" if apart else "the intervals overlap, so the difference is not established"
     text = (
         "With the camera outside the range it was trained on, the policy with geometry succeeds in "
         f"{_cell(geometry)} of episodes and RGB only in {_cell(rgb)}: {verdict}."
     )
-    of_both = [task for task, of_task in rows.groupby("task") if set(_RIVALS) <= set(of_task["arm"])]
+    of_both = [task for task, of_task in rows.groupby("task") if set(_COMPARED) <= set(of_task["arm"])]
     if of_both and rows["training_seed"].nunique() > 1:
-        difference, low, high = (100 * points for points in lead(rows[rows["task"].isin(of_both)], *_RIVALS))
+        difference, low, high = (
+            100 * points for points in pooled_difference(rows[rows["task"].isin(of_both)], *_COMPARED)
+        )
         text += (
-            f" Were training seeds drawn anew, the lead of {difference:+.0f} points would be {low:+.0f} to {high:+.0f}."
+            f" The difference is {difference:+.0f} points ({low:+.0f} to {high:+.0f}, 95 % bootstrap over training seeds and "
+            "episodes)."
         )
     controls = [_control(name, rows, arm) for arm, name in _NAMES.items() if arm in arms]
     return text + (f" For comparison: {', '.join(controls)}." if controls else "")
 
 
 def _control(name: str, rows: pd.DataFrame, arm: str) -> str:
-    """A rate beside geometry's; where the arm ran on some tasks only, beside geometry's on these."""
+    """The rate of an arm; if it ran on some tasks only, with geometry's rate on the same tasks."""
     tasks = rows.loc[rows["arm"] == arm, "task"].unique()
-    there = rows[rows["task"].isin(tasks)]
-    text = f"{name} {_rate(there, arm):.0%}"
+    of_tasks = rows[rows["task"].isin(tasks)]
+    text = f"{name} {_rate(of_tasks, arm):.0%}"
     if len(tasks) < rows["task"].nunique():
-        text += f" (on {', '.join(tasks)}, where geometry has {_rate(there, 'geometry'):.0%})"
+        text += f" (on {', '.join(tasks)}, where geometry has {_rate(of_tasks, 'geometry'):.0%})"
     return text
 
 
@@ -91,37 +94,38 @@ def _rate(rows: pd.DataFrame, arm: str) -> float:
     return float(rows.loc[rows["arm"] == arm, "success"].mean())
 
 
-_RIVALS = ("geometry", "rgb")
-_NAMES = {"rgb-wide": "RGB trained on the wide camera range", "random": "random tokens", "blind": "no camera at all"}
+_COMPARED = ("geometry", "rgb")
+_NAMES = {"rgb-wide": "RGB trained on the wide camera range", "random": "random tokens", "blind": "no camera"}
 
 
-def _what_was_done(page: Page, runs: Sequence[SimulatedRun]) -> None:
+def _setup(page: Page, runs: Sequence[SimulatedRun]) -> None:
     budget = runs[0].budget
     seeds = len({run.seed for run in runs})
     page.text(
         f"{len(runs)} training runs: {budget.episodes} expert episodes, {budget.steps} steps of {budget.batch_size} samples "
-        f"with {budget.flow_samples} flow samples each, {seeds} training seed{'s' if seeds > 1 else ''}; the same data, budget "
-        f"and sizes for every arm. Every cell is {budget.evaluation_episodes} unseen seeds per training seed, the same for "
-        f"every arm, with a new prediction every {budget.action_steps} steps. The raw table is episodes.csv."
+        f"with {budget.flow_samples} flow samples each, {seeds} training seed{'s' if seeds > 1 else ''}; data, budget and "
+        f"sizes are the same for every arm. Every cell has {budget.evaluation_episodes} unseen evaluation seeds per training "
+        f"seed, the same for every arm. A new chunk is predicted every {budget.action_steps} steps. All episodes are in "
+        "episodes.csv."
     )
     crashed = [run for run in runs if run.crash.exists()]
     if crashed:
         page.text(
-            "Crashed, and counted as failures: "
-            + "; ".join(f"{run.name} (its log: {run.log.name} in {run.folder.name})" for run in crashed)
+            "Crashed runs, counted as failures: "
+            + "; ".join(f"{run.name} (log: {run.folder.name}/{run.log.name})" for run in crashed)
         )
 
 
 def _task(
-    page: Page, task: str, found: list[Cell], versus: list[Versus], runs: Sequence[SimulatedRun], pictures: Path
+    page: Page, task: str, found: list[Cell], versus: list[ArmComparison], runs: Sequence[SimulatedRun], pictures: Path
 ) -> None:
     page.heading(task)
     conditions = [name for name in CONDITIONS if any(cell.condition == name for cell in found)]
     arms = [name for name in ARMS if any(cell.arm == name for cell in found)]
-    by_place = {(cell.arm, cell.condition): cell for cell in found}
-    bars = {arm: [_bar(by_place.get((arm, condition))) for condition in conditions] for arm in arms}
+    by_name = {(cell.arm, cell.condition): cell for cell in found}
+    bars = {arm: [_bar(by_name.get((arm, condition))) for condition in conditions] for arm in arms}
     titles = [CONDITIONS[condition].title for condition in conditions]
-    caption = "Success per arm and condition, over all training seeds; in the table, that of each of them in brackets."
+    caption = "Success per arm and condition over all training seeds. The table has each training seed in brackets."
     page.row(picture(success_figure(titles, bars), caption, pictures / f"success_{task}.png"))
     parameters = {run.arm_name: _parameters(run) for run in _finished(runs) if run.task == task}
     page.table(
@@ -131,15 +135,15 @@ def _task(
                 arm,
                 ARMS[arm].title,
                 parameters.get(arm, "crashed"),
-                *(_seeds(by_place.get((arm, c))) for c in conditions),
+                *(_seeds(by_name.get((arm, c))) for c in conditions),
             ]
             for arm in arms
         ],
     )
     if versus:
         page.text(
-            "geometry against each arm on the same seeds: difference of the success rates in points (95 % bootstrap interval "
-            "over training seeds and episodes), and the exact McNemar p, corrected for all comparisons of the study (Holm)."
+            "Success of geometry minus success of each arm on the same seeds, in points, with the 95 % bootstrap interval over "
+            "training seeds and episodes, and the exact McNemar p, corrected for all comparisons of the study (Holm)."
         )
         by_pair = {(v.arm, v.condition): v for v in versus}
         page.table(
@@ -154,28 +158,28 @@ def _task(
             page.row(video(clips, 10, title, pictures / f"rollout_{task}_{condition}.mp4"))
 
 
-def _inside(page: Page, runs: Sequence[SimulatedRun], pictures: Path) -> None:
-    """What a trained policy with geometry looks at, and how training went."""
+def _trained_policy(page: Page, runs: Sequence[SimulatedRun], pictures: Path) -> None:
+    """Attention of a trained policy with geometry, and the training loss."""
     trained = _finished(runs)
     first = next((run for run in trained if run.arm_name == "geometry"), None)
-    page.heading("Inside")
+    page.heading("Attention and training")
     if first is not None:
         loaded = load_policy(first.checkpoint)
         batch = loaded.preprocess(frame_batch(LeRobotDataset(f"local/{first.task}", root=first.data_folder), 0))
-        where = (
+        caption = (
             "The first frame of the dataset. Right: attention of the action tokens on geometry at the last denoising "
             "step, mean over layers, heads and tokens."
         )
-        page.row(picture(depth_figure(loaded.policy, batch), where, pictures / "depth.png"))
+        page.row(picture(depth_figure(loaded.policy, batch), caption, pictures / "depth.png"))
         page.row(
             picture(
                 layout_figure(loaded.policy, batch),
-                "Rows look at columns. The prefix never sees geometry; the actions see everything.",
+                "Rows are queries, columns are keys. The prefix does not attend to geometry; the actions attend to all segments.",
                 pictures / "layout.png",
             ),
             picture(
                 segment_share_figure(loaded.policy, batch),
-                "What the action tokens attend to, layer by layer.",
+                "Attention of the action tokens per segment and layer.",
                 pictures / "shares.png",
             ),
         )
@@ -186,7 +190,7 @@ def _inside(page: Page, runs: Sequence[SimulatedRun], pictures: Path) -> None:
 
 
 def _finished(runs: Sequence[SimulatedRun]) -> list[SimulatedRun]:
-    """Runs that did not crash: those that did may have left anything."""
+    """Runs that did not crash; the files of a crashed run may be incomplete."""
     return [run for run in runs if not run.crash.exists()]
 
 
@@ -206,13 +210,13 @@ def _cell(cell: Cell | None) -> str:
 
 
 def _seeds(cell: Cell | None) -> str:
-    """A cell, and the rate of every training seed where there are several."""
+    """A cell, with the rate of every training seed if there are several."""
     if cell is None or len(cell.by_seed) == 1:
         return _cell(cell)
     return f"{_cell(cell)} [{', '.join(f'{100 * rate:.0f}' for rate in cell.by_seed)}]"
 
 
-def _difference(versus: Versus | None) -> str:
+def _difference(versus: ArmComparison | None) -> str:
     if versus is None:
         return _NOT_EVALUATED
     result = versus.result
@@ -226,14 +230,14 @@ def _parameters(run: SimulatedRun) -> str:
 
 
 def _side_by_side(runs: Sequence[SimulatedRun], arms: Sequence[str], condition: str) -> np.ndarray | None:
-    """The first episodes of these arms on the same seeds, one after the other, (T, H, arms * W, 3)."""
+    """The first episodes of these arms on the same seeds, concatenated, (T, H, arms * W, 3)."""
     of_arm = {run.arm_name: run.evaluation(condition) for run in reversed(runs) if not run.crash.exists()}
     evaluations = [of_arm[arm] for arm in arms if of_arm.get(arm) is not None]
     if len(evaluations) != len(arms) or not arms:
         return None
     clips = []
     for episode in zip(*(evaluation.videos for evaluation in evaluations), strict=True):
-        length = max(len(clip) for clip in episode) + 5  # a short rest between episodes
+        length = max(len(clip) for clip in episode) + 5  # a pause between episodes
         padded = [np.concatenate([clip, clip[-1:].repeat(length - len(clip), axis=0)]) for clip in episode]
         clips.append(np.concatenate(padded, axis=2))
     return np.concatenate(clips) if clips else None

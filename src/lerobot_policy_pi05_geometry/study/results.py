@@ -1,7 +1,7 @@
-"""What came out of a study: a table with one row per episode, and what follows from it.
+"""Results of a study: a table with one row per episode, and success rates and comparisons computed from it.
 
-A run that crashed has its episodes in the table too, as failures marked `crashed`: leaving them out would make an arm that
-often crashes look better.
+The episodes of a crashed run are in the table as failures, marked `crashed`. Without them an arm that often crashes would
+appear better than it is.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ def episodes_table(runs: Sequence[SimulatedRun]) -> pd.DataFrame:
             crashed = evaluation is None and run.crash.exists()
             if evaluation is None and not crashed:
                 raise ValueError(
-                    f"Run {run.name} has not been evaluated under '{condition}' yet; let the study finish."
+                    f"Run {run.name} has not been evaluated under '{condition}'; start the study again to complete it."
                 )
             if evaluation is None:
                 seeds = list(range(run.budget.evaluation_episodes))
@@ -65,7 +65,7 @@ class Cell:
 
 
 def cells(table: pd.DataFrame) -> list[Cell]:
-    """Every cell of a study, tasks, arms and conditions in their own order."""
+    """Every cell of a study, in the order of ARMS and CONDITIONS."""
     found = []
     for (task, arm, condition), rows in table.groupby(["task", "arm", "condition"], sort=False):
         crashed = rows.loc[rows["crashed"], "training_seed"].nunique()
@@ -76,8 +76,8 @@ def cells(table: pd.DataFrame) -> list[Cell]:
 
 
 @dataclass(frozen=True)
-class Versus:
-    """One arm against the reference arm; `p` is corrected over all comparisons of the study."""
+class ArmComparison:
+    """The reference arm against one other arm; `p` is corrected for all comparisons of the study."""
 
     task: str
     condition: str
@@ -87,7 +87,7 @@ class Versus:
     p: float
 
 
-def comparisons(table: pd.DataFrame, reference: str = "geometry") -> list[Versus]:
+def comparisons(table: pd.DataFrame, reference: str = "geometry") -> list[ArmComparison]:
     """Every arm against the reference arm, on the same seeds, per task and condition."""
     found: list[tuple[str, str, str, Difference]] = []
     for (task, condition), rows in table.groupby(["task", "condition"], sort=False):
@@ -100,13 +100,13 @@ def comparisons(table: pd.DataFrame, reference: str = "geometry") -> list[Versus
             ]
     corrected = holm([difference.p for *_, difference in found])
     return [
-        Versus(task, condition, arm, reference, difference, p)
+        ArmComparison(task, condition, arm, reference, difference, p)
         for (task, condition, arm, difference), p in zip(found, corrected, strict=True)
     ]
 
 
-def lead(rows: pd.DataFrame, arm: str, over: str) -> tuple[float, float, float]:
-    """Success of one arm minus another's, mean over the tasks that `rows` of one condition are of, with a bootstrap interval."""
+def pooled_difference(rows: pd.DataFrame, arm: str, over: str) -> tuple[float, float, float]:
+    """Success of one arm minus another's, averaged over the tasks in `rows` (of one condition): mean, low, high."""
     grids = [[grid(of_task[of_task["arm"] == name]) for name in (arm, over)] for _, of_task in rows.groupby("task")]
     return bootstrap(*(first.astype(float) - second.astype(float) for first, second in grids))
 

@@ -1,15 +1,15 @@
-"""One run of a study: train an arm from a seed, then evaluate it under conditions. Where it is kept, what it needs.
+"""One run of a study: train an arm from a seed, then evaluate it under conditions. Its inputs and its folder.
 
 ```
    <root>/runs/<name>-<hash>/    run.json                  the run, for its worker
-                                 run.log                   LeRobot's own training log, and what followed
+                                 run.log                   LeRobot's training log, then the evaluation's progress
                                  trained/                  LeRobot's output folder
-                                 <condition>-<hash>.npz    what came out
+                                 <condition>-<hash>.npz    outcome of an evaluation
                                  crashed.json              only if it crashed
 ```
 
-The hashes are of everything the result depends on, so a folder can be used again and again: what is there is not done
-again, and another budget is another run.
+A hash covers everything that the result depends on. So a folder can be reused: finished parts are not repeated, and another
+budget is another run.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from typing import Any
 
 from .arms import Arm, find_arm
 
-Say = Callable[[str, int, int], None]  # what is being done, how much of it is done, how much there is
+ReportProgress = Callable[[str, int, int], None]  # (stage, work done, total work)
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Run(ABC):
     @property
     @abstractmethod
     def name(self) -> str:
-        """What people call it."""
+        """Name of the run, for people."""
 
     @property
     @abstractmethod
@@ -53,26 +53,26 @@ class Run(ABC):
 
     @abstractmethod
     def description(self) -> dict[str, Any]:
-        """What the trained policy depends on."""
+        """Everything that the trained policy depends on."""
 
     @abstractmethod
     def evaluation_description(self, condition: str) -> dict[str, Any]:
-        """What else the outcome under a condition depends on."""
+        """What the outcome under a condition depends on in addition."""
 
     @abstractmethod
-    def own_conditions(self) -> list[str]:
-        """Conditions that have to be evaluated for this run."""
+    def distinct_conditions(self) -> list[str]:
+        """Conditions to evaluate: those that differ for this arm."""
 
     @abstractmethod
-    def prepare(self, say: Say) -> None:
-        """Make what training needs; several runs may share it, and call this at the same time."""
+    def prepare(self, report_progress: ReportProgress) -> None:
+        """Create the inputs of training. Several runs may share them and call this at the same time."""
 
     @abstractmethod
     def train(self, output: Path) -> None:
         """Train into LeRobot's output folder."""
 
     @abstractmethod
-    def evaluate(self, condition: str, say: Say) -> None:
+    def evaluate(self, condition: str, report_progress: ReportProgress) -> None:
         """Evaluate the checkpoint and write the outcome."""
 
     @property
@@ -86,7 +86,7 @@ class Run(ABC):
 
     @cached_property
     def folder(self) -> Path:
-        # Kept, since a launcher asks all the time, and what the hash is made of takes time to read.
+        # Cached: the launcher reads it often, and some descriptions read files.
         return self.root / "runs" / f"{self.name}-{short_hash(self.description())}"
 
     @property
@@ -103,26 +103,26 @@ class Run(ABC):
         return self.folder / "crashed.json"
 
     def outcome(self, condition: str) -> Path:
-        """Where the outcome of one of its own conditions is kept."""
+        """File of the outcome under one of its distinct conditions."""
         return self.folder / f"{condition}-{short_hash(self.evaluation_description(condition))}.npz"
 
     def missing(self) -> list[str]:
         """Conditions that have not been evaluated yet."""
-        return [condition for condition in self.own_conditions() if not self.outcome(condition).exists()]
+        return [condition for condition in self.distinct_conditions() if not self.outcome(condition).exists()]
 
     def to_json(self) -> str:
-        """Everything a worker needs."""
+        """The run as JSON, for its worker."""
         return json.dumps({"kind": type(self).__name__, **asdict(self)}, default=str)
 
 
 @cache
 def versions(*packages: str) -> dict[str, str]:
-    """What a result also depends on."""
+    """Installed versions; results depend on them too."""
     return {name: version(name) for name in packages}
 
 
 def short_hash(content: dict[str, Any]) -> str:
-    """Ten digits that change with the content."""
+    """First ten hexadecimal digits of a SHA-256 of the content."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:10]
 
 

@@ -1,4 +1,4 @@
-"""A run in the simulator: the same expert episodes for every arm, success on the same unseen seeds."""
+"""A run in the simulator: the same expert episodes for every arm, success on the same evaluation seeds."""
 
 import itertools
 from dataclasses import asdict, dataclass
@@ -12,19 +12,19 @@ from ..sim.evaluate import Evaluation, evaluate
 from ..sim.record import record
 from ..sim.sensor import SENSORS
 from ..sim.tasks import find_task
-from .conditions import counts_as, find_condition
-from .locks import alone
-from .runs import Run, Say, option_list, short_hash, versions
+from .conditions import equivalent_condition, find_condition
+from .locks import folder_lock
+from .runs import ReportProgress, Run, option_list, short_hash, versions
 from .spec import Budget, StudySpec
 from .training import train_with
 
-_EVALUATION = ("evaluation_episodes", "parallel", "videos")  # of the budget: what training does not depend on
+_EVALUATION = ("evaluation_episodes", "parallel", "videos")  # fields of the budget that training does not depend on
 _PACKAGES = ("lerobot_policy_pi05_geometry", "lerobot", "torch", "mujoco", "metaworld")
 
 
 @dataclass(frozen=True)
 class SimulatedRun(Run):
-    """A task, an arm and a training seed. Its data is kept in <root>/data/<task>-<cameras>-<hash>/."""
+    """A task, an arm and a training seed. Its dataset is <root>/data/<task>-<cameras>-<hash>/."""
 
     task: str
     budget: Budget
@@ -42,7 +42,7 @@ class SimulatedRun(Run):
         return self.budget.evaluation_episodes
 
     def data_description(self) -> dict[str, Any]:
-        """What the expert episodes depend on."""
+        """Everything that the expert episodes depend on."""
         return {
             "task": asdict(find_task(self.task)),
             "cameras": asdict(CAMERA_RANGES[self.arm.cameras]),
@@ -68,22 +68,22 @@ class SimulatedRun(Run):
     def data_folder(self) -> Path:
         return self.root / "data" / f"{self.task}-{self.arm.cameras}-{short_hash(self.data_description())}"
 
-    def own_conditions(self) -> list[str]:
-        return list(dict.fromkeys(counts_as(condition, self.arm.depth) for condition in self.conditions))
+    def distinct_conditions(self) -> list[str]:
+        return list(dict.fromkeys(equivalent_condition(condition, self.arm.depth) for condition in self.conditions))
 
     def evaluation(self, condition: str) -> Evaluation | None:
-        """The episodes that count for a condition; None while they are missing."""
-        path = self.outcome(counts_as(condition, self.arm.depth))
+        """The episodes of a condition; None before evaluation."""
+        path = self.outcome(equivalent_condition(condition, self.arm.depth))
         return Evaluation.load(path) if path.exists() else None
 
-    def prepare(self, say: Say) -> None:
+    def prepare(self, report_progress: ReportProgress) -> None:
         budget, cameras = self.budget, self.arm.cameras
-        with alone(self.data_folder):
+        with folder_lock(self.data_folder):
             if self.data_folder.exists():
                 return
             repo_id = f"local/{self.task}"
             for done, _ in record(self.data_folder, repo_id, self.task, budget.episodes, cameras, budget.image_size):
-                say("record", done, budget.episodes)
+                report_progress("record", done, budget.episodes)
 
     def train(self, output: Path) -> None:
         train_with(self.arguments(output))
@@ -120,7 +120,7 @@ class SimulatedRun(Run):
         }
         return option_list(options)
 
-    def evaluate(self, condition: str, say: Say) -> None:
+    def evaluate(self, condition: str, report_progress: ReportProgress) -> None:
         about, budget = find_condition(condition), self.budget
         environment = MetaworldRgbdEnv(
             task=self.task, cameras=about.cameras, sensor=about.sensor, image_size=budget.image_size
@@ -131,14 +131,14 @@ class SimulatedRun(Run):
             budget.evaluation_episodes,
             parallel=budget.parallel,
             videos=budget.videos,
-            progress=lambda done: say(f"evaluate {condition}", done, budget.evaluation_episodes),
+            progress=lambda done: report_progress(f"evaluate {condition}", done, budget.evaluation_episodes),
         ).save(self.outcome(condition))
 
 
 def runs_of(spec: StudySpec, root: Path) -> list[SimulatedRun]:
-    """Every run of a study once, seed by seed, so that a study that was cut off has whole seeds.
+    """Every run of a study, seed by seed, so that an interrupted study has complete seeds.
 
-    An arm that several blocks name for a task is one run, under the conditions of all of them.
+    An arm that several blocks name for a task is one run, evaluated under the conditions of all of them.
     """
     wanted: dict[tuple[str, str], dict[str, None]] = {}
     for comparison in spec.comparisons:

@@ -1,11 +1,11 @@
-"""What a study is: tasks x arms x seeds x conditions, and a budget for every run. Read from a small TOML file.
+"""A study: tasks x arms x seeds x conditions, and a budget for every run. Read from a TOML file.
 
 seeds = [0, 1, 2]
 
-[budget]                        # any field of `Budget`; what is left out keeps its default
+[budget]                        # any field of `Budget`; other fields keep their defaults
 steps = 1500
 
-[[compare]]                     # as many blocks as you like; what two of them ask of the same arm adds up
+[[compare]]                     # any number of blocks; an arm in two of them is trained once, for the conditions of both
 tasks = ["button-press-topdown-wide"]
 arms = ["blind", "rgb", "geometry"]
 conditions = ["inside", "outside"]
@@ -25,20 +25,20 @@ STUDIES = Path(__file__).parent / "studies"
 
 @dataclass(frozen=True)
 class Budget:
-    """What every run may spend, and the sizes of all networks. docs/results.md says how the defaults were chosen."""
+    """Training and evaluation budget of every run, and the network size. Defaults: see docs/results.md."""
 
     variant: str = "small"
-    episodes: int = 200  # of the expert, to learn from
+    episodes: int = 200  # expert episodes in the training data
     steps: int = 1500
     batch_size: int = 16
     learning_rate: float = 1e-3
     flow_samples: int = 4
     chunk_size: int = 8
-    action_steps: int = 2  # of a chunk, before the next one is predicted
+    action_steps: int = 2  # executed steps of a chunk before the next one is predicted
     image_size: int = 84
     evaluation_episodes: int = 50
     parallel: int = 10  # episodes stepped together
-    videos: int = 2  # episodes of each cell to keep frames of
+    videos: int = 2  # episodes of each cell whose frames are kept
     device: str = "cpu"
 
 
@@ -70,9 +70,9 @@ class StudySpec:
 
 
 def read_spec(path: str | Path) -> StudySpec:
-    """A study from a TOML file, or one of those that come with the package, by name (`default`, `smoke`).
+    """A study from a TOML file, or a study of this package by name (`default`, `smoke`).
 
-    Raises FileNotFoundError or ValueError with one sentence for a file that is not there or says something unknown.
+    Raises FileNotFoundError if there is no such file, and ValueError for invalid TOML or unknown names.
     """
     file = Path(path)
     if not file.is_file() and (STUDIES / f"{path}.toml").is_file():
@@ -84,10 +84,10 @@ def read_spec(path: str | Path) -> StudySpec:
         content = tomllib.loads(file.read_text())
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{file} is not valid TOML: {error}.") from error
-    _only(content, {"seeds", "budget", "compare"}, str(file))
+    _check_keys(content, {"seeds", "budget", "compare"}, str(file))
     comparisons = []
     for block in content.get("compare", []):
-        _only(block, {f.name for f in fields(Comparison)}, f"[[compare]] of {file}")
+        _check_keys(block, {f.name for f in fields(Comparison)}, f"[[compare]] of {file}")
         lists = {name: tuple(block.get(name, ())) for name in ("tasks", "arms", "conditions")}
         for name, values in lists.items():
             if not values:
@@ -96,13 +96,13 @@ def read_spec(path: str | Path) -> StudySpec:
             find_task(task)
         comparisons.append(Comparison(**lists))
     budget = content.get("budget", {})
-    _only(budget, {f.name for f in fields(Budget)}, f"[budget] of {file}")
+    _check_keys(budget, {f.name for f in fields(Budget)}, f"[budget] of {file}")
     return StudySpec(tuple(content.get("seeds", ())), tuple(comparisons), Budget(**budget))
 
 
-def _only(content: dict[str, Any], known: set[str], where: str) -> None:
+def _check_keys(content: dict[str, Any], known: set[str], where: str) -> None:
     unknown = sorted(set(content) - known)
     if unknown:
         raise ValueError(
-            f"{where} has {', '.join(unknown)}, which means nothing; known are {', '.join(sorted(known))}."
+            f"{where} has unknown entries {', '.join(unknown)}; known entries are {', '.join(sorted(known))}."
         )

@@ -1,8 +1,8 @@
-"""What a difference between two arms is worth.
+"""Intervals and tests for success rates and their differences.
 
-Episodes are paired: the same training seed and the same evaluation seed show both arms the same scene. So arms are compared
-by their discordant pairs (exact McNemar test; McNemar, 1947), corrected for the number of comparisons (Holm, 1979), and the
-size of a difference has an interval from a bootstrap over training seeds and, within them, episodes.
+Episodes are paired: with the same training seed and evaluation seed, both arms observe the same scene. So arms are compared
+by their discordant pairs (exact McNemar test; McNemar, 1947), corrected for the number of comparisons (Holm, 1979). The
+interval of a difference is from a bootstrap over training seeds and, within them, episodes.
 """
 
 from collections.abc import Sequence
@@ -44,8 +44,7 @@ def compare(first: np.ndarray, second: np.ndarray) -> Difference:
 def bootstrap(*tables: np.ndarray) -> tuple[float, float, float]:
     """Mean of (training seeds, episodes) values, with its 95 % interval: seeds are resampled, then episodes within them.
 
-    Of several tables, one per task, the mean of their means. The resampling itself is always the same, so that a report
-    repeats exactly.
+    For several tables, one per task: the mean of their means. The resampling has a fixed seed, so a report is reproducible.
     """
     random = np.random.default_rng(0)
     means = []
@@ -59,7 +58,7 @@ def bootstrap(*tables: np.ndarray) -> tuple[float, float, float]:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's step-down correction: p-values adjusted for all being looked at."""
+    """Holm's step-down correction: p-values adjusted for the number of tests."""
     order = np.argsort(p_values)
     adjusted = np.empty(len(p_values))
     largest = 0.0

@@ -13,7 +13,7 @@ from .frames_in_memory import train_in_memory
 def train_with(arguments: list[str], in_memory: bool = True) -> None:
     """Train in this process with lerobot-train's arguments; LeRobot parses the command line itself.
 
-    in_memory: keep decoded frames in memory (images that fit; see frames_in_memory.py), or read them as LeRobot does.
+    in_memory: keep decoded frames in memory (frames_in_memory.py), or read them from disk as LeRobot does.
     """
     sys.argv = ["lerobot-train", *arguments]
     (train_in_memory if in_memory else train_from_disk)()
@@ -21,7 +21,7 @@ def train_with(arguments: list[str], in_memory: bool = True) -> None:
 
 @parser.wrap()
 def train_from_disk(cfg: TrainPipelineConfig) -> None:
-    """`lerobot-train`, with the same arguments, after a look at what only the whole configuration shows."""
+    """`lerobot-train` with the same arguments, after checks that need the whole configuration."""
     cfg.validate()
     refuse_augmentation(cfg)
     train(cfg)

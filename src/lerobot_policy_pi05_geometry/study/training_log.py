@@ -1,4 +1,4 @@
-"""LeRobot's training log, read back."""
+"""Steps and losses from LeRobot's training log."""
 
 from pathlib import Path
 
@@ -14,9 +14,9 @@ def read_log_line(line: str) -> dict | None:
 
 
 class TrainingCurve:
-    """Steps and losses of a training, from its log lines; of its last start, if it was started more than once.
+    """Steps and losses of a training from its log lines. If it was started more than once: of its last start.
 
-    every: steps between two lines. LeRobot rounds steps from 1,000 on ("1K"), so they are counted and not read.
+    every: steps between two lines. LeRobot rounds steps from 1,000 on ("1K"), so lines are counted instead.
     """
 
     def __init__(self, every: int) -> None:
@@ -25,7 +25,7 @@ class TrainingCurve:
         self.losses: list[float] = []
 
     def add(self, line: str) -> bool:
-        """Take note of a line; whether it was one of the training's."""
+        """Add a log line; returns whether it was a training line."""
         point = read_log_line(line)
         if point is None:
             return False
@@ -38,7 +38,7 @@ class TrainingCurve:
 
 
 def read_curve(log: Path, every: int) -> dict[str, list]:
-    """Training loss of a run, from its log with a line every so many steps."""
+    """Training loss of a run from its log. every: steps between two lines."""
     curve = TrainingCurve(every)
     for line in log.read_text().splitlines():
         curve.add(line)

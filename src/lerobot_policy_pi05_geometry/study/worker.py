@@ -1,8 +1,8 @@
-"""Carries out one run: prepare, train, evaluate. Whatever is there already is kept.
+"""Executes one run: prepare, train, evaluate. Finished parts are kept.
 
-A process of its own, so that a crash takes nothing with it: `python -m lerobot_policy_pi05_geometry.study.worker RUN`, where
-RUN is the run as JSON. Killed at any point and started again, it gives the same result: every step appears whole or not
-at all, and training starts anew from the same seed. Two processes on the same run wait for each other.
+It is a separate process, so that a crash affects one run only: `python -m lerobot_policy_pi05_geometry.study.worker RUN`,
+where RUN is a file with the run as JSON. Killed at any time and started again, it gives the same result: each part is written
+completely or not at all, and training restarts from the same seed. A lock keeps two processes from executing the same run.
 """
 
 import json
@@ -12,33 +12,33 @@ import sys
 from pathlib import Path
 
 from . import held_out, simulated
-from .locks import alone
+from .locks import folder_lock
 from .runs import Run
 
 logger = logging.getLogger(__name__)
-PROGRESS = "progress:"  # then what is being done, and how far: "progress: evaluate outside 10/50"
+PROGRESS = "progress:"  # followed by stage and count: "progress: evaluate outside 10/50"
 _KINDS = {"SimulatedRun": simulated.from_json, "HeldOutRun": held_out.from_json}
 
 
-def carry_out(run: Run) -> None:
-    """Do what is missing of a run."""
+def execute(run: Run) -> None:
+    """Execute the missing parts of a run."""
     run.folder.mkdir(parents=True, exist_ok=True)
-    run.prepare(_say)
-    with alone(run.folder):
+    run.prepare(_log_progress)
+    with folder_lock(run.folder):
         if not run.checkpoint.exists():
             output = run.folder / "training"
-            shutil.rmtree(output, ignore_errors=True)  # what is left of a training that was cut off
+            shutil.rmtree(output, ignore_errors=True)  # of an interrupted training
             run.train(output)
             output.rename(run.folder / "trained")
         for condition in run.missing():
-            run.evaluate(condition, _say)
+            run.evaluate(condition, _log_progress)
 
 
-def _say(what: str, done: int, total: int) -> None:
-    logger.warning("%s %s %d/%d", PROGRESS, what, done, total)
+def _log_progress(stage: str, done: int, total: int) -> None:
+    logger.warning("%s %s %d/%d", PROGRESS, stage, done, total)
 
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     content = json.loads(Path(sys.argv[1]).read_text())
-    carry_out(_KINDS[content["kind"]](content))
+    execute(_KINDS[content["kind"]](content))
