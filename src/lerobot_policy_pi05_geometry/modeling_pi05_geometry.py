@@ -41,6 +41,7 @@ from .model.segments import GeometryTokens
 from .training.lora import always_in_full, peft_targets
 from .training.micro_batches import each_of, require_whole_parameters, rows_of, sum_of
 from .training.parameter_groups import FULL_STATE
+from .training.sharding import UNIT_CLASSES
 from .weight_files.files import find_file, require_policy_type
 from .weight_files.strict_load import load_strictly
 
@@ -67,6 +68,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
 
     config_class = PI05GeometryConfig
     name = "pi05_geometry"
+    _fsdp_wrap_modules = UNIT_CLASSES  # read by LeRobot 0.6.2
 
     def __init__(
         self,

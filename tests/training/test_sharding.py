@@ -45,6 +45,17 @@ def batch_of(step: int) -> dict:
     return batch
 
 
+def test_the_units_are_known_by_the_names_of_their_classes():
+    """LeRobot 0.6.2 wraps by class name; `fsdp_units` by type. Both have to find the same modules."""
+    policy = make_policy(geometry_expert="own")
+    inner = {
+        id(m) for unit in fsdp_units(policy) for m in unit.modules() if type(m).__name__ in policy._fsdp_wrap_modules
+    }
+    by_name = {id(m) for m in policy.modules() if type(m).__name__ in policy._fsdp_wrap_modules}
+    assert {id(unit) for unit in fsdp_units(policy)} <= by_name
+    assert by_name == inner
+
+
 def train(policy: PI05GeometryPolicy, model, rows: slice) -> list[float]:
     """Losses of these rows; the policy's weights move."""
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())

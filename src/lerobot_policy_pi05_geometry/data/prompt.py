@@ -126,6 +126,10 @@ class PortableTokenizerProcessorStep(TokenizerProcessorStep):
         self.loaded()
         return {name: torch.frombuffer(bytearray(content), dtype=torch.uint8) for name, content in self._files.items()}
 
+    def save_artifacts(self, save_directory: Path) -> dict[str, str]:
+        """No files beside the step's state, which holds the tokenizer. LeRobot 0.6.2 asks; 0.6.1 does not."""
+        return {}
+
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         if set(state) != set(_FILES):
             raise ValueError(

@@ -6,16 +6,18 @@ actions. The samples are LeRobot's, bit for bit; the training loop is LeRobot's 
 prepares its data loader as an argument.
 """
 
+from functools import partial
+
 import torch
 from accelerate import Accelerator
 from accelerate.utils import DistributedDataParallelKwargs
 from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.scripts.lerobot_train import train
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from ..compat import train_with_accelerator
 from ..precompute.augmentation import refuse_augmentation
 
 
@@ -75,12 +77,15 @@ def train_in_memory(cfg: TrainPipelineConfig) -> None:
     """`lerobot-train`, with the same arguments, for a dataset whose frames fit into memory."""
     cfg.validate()
     refuse_augmentation(cfg)
+    train_with_accelerator(cfg, partial(_make_accelerator, cfg))
+
+
+def _make_accelerator(cfg: TrainPipelineConfig) -> InMemoryAccelerator:
     policy = cfg.trainable_config
     precision = {"bfloat16": "bf16", "float16": "fp16"}.get(getattr(policy, "dtype", ""), "no")
-    accelerator = InMemoryAccelerator(
+    return InMemoryAccelerator(
         step_scheduler_with_optimizer=False,
         mixed_precision=precision,
         kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
         cpu=policy.device == "cpu",
     )
-    train(cfg, accelerator=accelerator)

@@ -14,6 +14,17 @@ from transformers.models.siglip.modeling_siglip import SiglipEncoderLayer
 from ..model.gemma import GemmaLayer
 from ..model.precision import Float32Module
 
+# Names of the classes whose modules are units, which LeRobot 0.6.2 asks a policy for (`_fsdp_wrap_modules`).
+UNIT_CLASSES = (
+    "GemmaLayer",
+    "SiglipEncoderLayer",
+    "LayerNorm",
+    "RMSNorm",
+    "Float32Linear",
+    "GeometryGate",
+    "GeometryAdapter",
+)
+
 
 def fsdp_units(policy: nn.Module) -> list[nn.Module]:
     """Modules to shard one by one, inner ones first; the policy itself is the last unit, and not among them."""
