@@ -5,10 +5,11 @@
    studies       demo, study                 simulation   record, train, evaluate
    checkpoints   inspect, bench, convert, export, merge
    datasets      quantiles, precompute       planning     plan
+   serving       serve
 ```
 """
 
-from . import studies, simulation, checkpoints, datasets, planning  # noqa: F401, I001 (the order of --help)
+from . import studies, simulation, checkpoints, datasets, planning, serving  # noqa: F401, I001 (the order of --help)
 from .app import app, console
 
 __all__ = ["app", "console"]

@@ -1,0 +1,193 @@
+"""Checked requests of a batch in, action chunks out: processors and policy, as a local run calls them."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from lerobot.policies.rtc.relative import reanchor_relative_rtc_prefix
+from lerobot.processor import NormalizerProcessorStep, RelativeActionsProcessorStep
+from torch import Tensor
+
+from ..geometry.keys import CALIBRATION_PREFIX, is_geometry_key
+from ..checkpoint.load import LoadedPolicy
+from .inputs import Guidance, Inputs, Request
+from .limits import RequestError
+from .noise import request_noise
+from .session import Session
+
+
+class Job(NamedTuple):
+    """A request with what its session adds.
+
+    noise: (S, max_action_dim). begins: the first of an episode. left_over: what of the session's last chunk was not executed,
+    normalised, (T, A), and absolute as it was sent; None without guidance.
+    """
+
+    request: Request
+    noise: Tensor
+    begins: bool
+    left_over: Tensor | None = None
+    absolute: Tensor | None = None
+
+    @property
+    def group(self) -> tuple:
+        """Jobs with the same one can share a batch."""
+        arrays = sorted((key, array.shape, array.dtype.str) for key, array in self.request.observation.items())
+        return tuple(arrays), self.guidance, None if self.left_over is None else len(self.left_over)
+
+    @property
+    def guidance(self) -> Guidance | None:
+        """What guides this chunk. How many steps were executed has had its effect already: it cut the left-over."""
+        given = self.request.guidance
+        return None if given is None or self.left_over is None else given._replace(executed_steps=0)
+
+
+class Answer(NamedTuple):
+    """A chunk (S, A) float32 for the robot, and normalised for the session; how long its batch was computed and how many
+    requests were in it, and how long it waited."""
+
+    actions: np.ndarray
+    chunk: Tensor
+    infer_ms: float
+    batch: int
+    queue_ms: float = 0.0
+
+
+def make_job(session: Session, request: Request, seed: int, shape: tuple[int, int]) -> Job:
+    """The job of a session's next request. shape: of the noise."""
+    if request.noise is None:
+        noise = request_noise(seed, session.name, session.requests, shape)
+    else:
+        noise = torch.from_numpy(np.array(request.noise))  # a copy: the frame's own memory cannot be written to
+    left_over = absolute = None
+    if request.guidance is not None and session.chunk is not None and session.absolute is not None:
+        executed = request.guidance.executed_steps
+        if executed < len(session.chunk):  # else nothing is left to continue
+            left_over, absolute = session.chunk[executed:], session.absolute[executed:]
+    return Job(request, noise, session.begins, left_over, absolute)
+
+
+def note_answer(session: Session, request: Request, answer: Answer) -> None:
+    """What the session keeps of an answer that is being sent."""
+    session.requests += 1
+    session.begins = False
+    session.seen.update(key for key in request.observation if is_geometry_key(key))
+    session.chunk, session.absolute = answer.chunk, torch.from_numpy(answer.actions)
+
+
+class PolicyEngine:
+    """Runs a loaded policy on batches of jobs. One thread at a time."""
+
+    def __init__(self, loaded: LoadedPolicy, guidance: RTCConfig | None = None) -> None:
+        """guidance: what real-time chunking uses where a request does not say; the checkpoint's by default."""
+        self.policy, self.config = loaded.policy.eval(), loaded.policy.config
+        self._preprocess, self._postprocess = loaded.preprocess, loaded.postprocess
+        self._guidance = guidance or self.config.rtc_config or RTCConfig()
+        self._set_guidance(None)
+        steps = getattr(loaded.preprocess, "steps", ())
+        self._relative = next((s for s in steps if isinstance(s, RelativeActionsProcessorStep) and s.enabled), None)
+        self._normalizer = next((s for s in steps if isinstance(s, NormalizerProcessorStep)), None)
+
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """(S, max_action_dim)."""
+        return self.config.chunk_size, self.config.max_action_dim
+
+    def run(self, jobs: Sequence[Job], size: int) -> list[Answer]:
+        """Chunks of jobs of one group, computed as a batch of `size`: the last job fills it up.
+
+        Raises RequestError if a chunk holds a number that is not finite, ValueError for what the policy refuses.
+        """
+        start = time.perf_counter()
+        filled = [*jobs, *[jobs[-1]] * (size - len(jobs))]
+        if any(job.begins for job in jobs):
+            self.policy.reset()  # values of observations are looked into at the start of an episode
+        with torch.no_grad():  # real-time chunking differentiates, which inference mode forbids
+            batch = self._preprocess(collate([job.request for job in filled]))
+            noise = torch.stack([job.noise for job in filled]).to(self.config.device)
+            with self._guided(filled) as how:
+                chunk = self.policy.predict_action_chunk(batch, noise=noise, **how)
+            actions = self._postprocess(chunk).float().cpu()  # (B, S, A)
+            chunk = chunk.cpu()
+        if not actions.isfinite().all():
+            raise RequestError("The policy computed an action that is not finite from this observation.")
+        spent = (time.perf_counter() - start) * 1e3
+        # Copies: a row must not keep its whole batch in memory.
+        return [Answer(actions[i].numpy().copy(), chunk[i].clone(), spent, len(jobs)) for i in range(len(jobs))]
+
+    def warm(self, inputs: Inputs, sizes: Sequence[int]) -> None:
+        """Run every size of batch once with a short and a long instruction, so that kernels are loaded and graphs recorded."""
+        for size in sizes:
+            for words in (1, 6):
+                request = Request(_blank(inputs, self.config.depth_unit), "warm up " * words, None, None)
+                self.run([Job(request, torch.zeros(self.noise_shape), begins=True)], size)
+        self.policy.reset()
+
+    @contextmanager
+    def _guided(self, jobs: Sequence[Job]) -> Iterator[dict[str, Any]]:
+        """Real-time chunking switched on for these jobs, if they want it: arguments of `predict_action_chunk`."""
+        guidance = jobs[0].guidance
+        if guidance is None:
+            yield {}
+            return
+        self._set_guidance(guidance)
+        try:
+            yield {"inference_delay": guidance.inference_delay, "prev_chunk_left_over": self._left_over(jobs)}
+        finally:
+            self._set_guidance(None)
+
+    def _set_guidance(self, guidance: Guidance | None) -> None:
+        self.config.rtc_config = None
+        if guidance is not None:
+            given, default = guidance, self._guidance
+            self.config.rtc_config = RTCConfig(
+                enabled=True,
+                execution_horizon=given.execution_horizon or default.execution_horizon,
+                max_guidance_weight=given.max_guidance_weight or default.max_guidance_weight,
+                prefix_attention_schedule=given.prefix_attention_schedule or default.prefix_attention_schedule,
+            )
+        self.policy.init_rtc_processor()
+
+    def _left_over(self, jobs: Sequence[Job]) -> Tensor:
+        """(B, T, A) normalised. Relative actions are relative to a state that has changed since, so they are computed anew."""
+        if self._relative is None:
+            return torch.stack([job.left_over for job in jobs if job.left_over is not None]).to(self.config.device)
+        state = self._relative.get_cached_state()
+        assert state is not None  # the preprocessor has just seen it
+        absolute = torch.stack([job.absolute for job in jobs if job.absolute is not None])
+        return reanchor_relative_rtc_prefix(absolute, state, self._relative, self._normalizer, str(self.config.device))
+
+
+def collate(requests: Sequence[Request]) -> dict[str, Any]:
+    """A raw observation batch, converted as LeRobot's robots and environments do: images (B, 3, H, W) float32 in [0, 1]."""
+    batch: dict[str, Any] = {"task": [request.task for request in requests]}
+    for key in requests[0].observation:
+        arrays = torch.from_numpy(np.stack([request.observation[key] for request in requests]))
+        if key.startswith(CALIBRATION_PREFIX) or arrays.ndim < 3:
+            batch[key] = arrays
+        elif is_geometry_key(key):
+            batch[key] = arrays[:, None]
+        else:
+            images = arrays.float() / 255 if arrays.dtype == torch.uint8 else arrays
+            batch[key] = images.permute(0, 3, 1, 2).contiguous()
+    return batch
+
+
+def _blank(inputs: Inputs, depth_unit: str) -> dict[str, np.ndarray]:
+    """An observation with every key: grey images, a wall 1 m away, cameras at the origin."""
+    observation = {}
+    for key, entry in inputs.expected.items():
+        if key.startswith(CALIBRATION_PREFIX):
+            observation[key] = np.eye(4, dtype=np.float32)
+        elif is_geometry_key(key):
+            observation[key] = np.full(entry.shape, 1000 if depth_unit == "mm" else 1, dtype=np.float32)
+        elif len(entry.shape) == 3:
+            size = inputs.trained_size[key]
+            observation[key] = np.full((*size, 3), 127, dtype=np.uint8)
+        else:
+            observation[key] = np.zeros(entry.shape, dtype=np.float32)
+    return observation

@@ -1,0 +1,31 @@
+"""What a request may cost, and the errors that a client is told of."""
+
+from dataclasses import dataclass
+
+MIB = 2**20
+
+
+class RequestError(ValueError):
+    """A request that cannot be answered; its message is one sentence for the client and holds nothing of the server."""
+
+
+class BusyError(RequestError):
+    """The server has no room for the request now."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds that hold before anything is allocated.
+
+    A request with two RGB-D cameras of 640 x 480 pixels is 3 MiB, with float32 images 9 MiB.
+    """
+
+    frame_bytes: int = 32 * MIB
+    values: int = 4096  # of a frame: maps, their keys, arrays, strings, numbers
+    depth: int = 8  # nested maps and lists
+    arrays: int = 64
+    dimensions: int = 4  # of an array
+    text: int = 4096  # bytes of a string
+    image_side: int = 4096  # pixels
+    sessions: int = 64
+    queue: int = 64  # requests that wait
