@@ -50,7 +50,9 @@ def read_key(path: Path | None) -> str | None:
     Not an option of the command: every user of a machine sees the commands that run. Raises ValueError for one that is too short.
     """
     if path is not None and not path.is_file():
-        raise FileNotFoundError(f"Key file {path} is not there; write a key of at least {KEY_LENGTH} characters into it.")
+        raise FileNotFoundError(
+            f"Key file {path} is not there; write a key of at least {KEY_LENGTH} characters into it."
+        )
     given = os.environ.get(KEY_VARIABLE) if path is None else path.read_text()
     if not given:
         return None

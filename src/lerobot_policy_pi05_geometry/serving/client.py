@@ -57,8 +57,9 @@ class PolicyClient:
 
     def send(self, request: dict[str, Any]) -> None:
         """Send a request, whose answer `receive` waits for."""
+        connection, frame = self._open, encode(request)
         try:
-            self._open.send(encode(request))
+            connection.send(frame)
         except (ConnectionClosed, OSError) as error:
             self.close()
             raise ServerLostError(f"The connection to {self._url} broke.") from error
@@ -66,8 +67,9 @@ class PolicyClient:
     def receive(self, deadline: float | None = None) -> dict[str, Any]:
         """The next answer. deadline: of `time.monotonic`; None: the timeout from now on."""
         left = self._timeout if deadline is None else max(deadline - time.monotonic(), 0.0)
+        connection = self._open
         try:
-            frame = self._open.recv(timeout=left)
+            frame = connection.recv(timeout=left)
         except TimeoutError as error:
             self.close()  # so that the late answer is never taken for another request's
             raise ServerLostError(f"{self._url} has not answered within {self._timeout:g} s.") from error

@@ -12,8 +12,8 @@ from lerobot.policies.rtc.relative import reanchor_relative_rtc_prefix
 from lerobot.processor import NormalizerProcessorStep, RelativeActionsProcessorStep
 from torch import Tensor
 
-from ..geometry.keys import CALIBRATION_PREFIX, is_geometry_key
 from ..checkpoint.load import LoadedPolicy
+from ..geometry.keys import CALIBRATION_PREFIX, is_geometry_key
 from .inputs import Guidance, Inputs, Request
 from .limits import RequestError
 from .noise import request_noise

@@ -27,7 +27,13 @@ _FLOATS = ("<f4", "<f8")
 _IMAGE = (0, 0, 3)  # any height and width
 _NESTED = ("images", "depth", "extrinsics")
 _TASKS = ("prompt", "task")
-_GUIDANCE = ("inference_delay", "executed_steps", "execution_horizon", "max_guidance_weight", "prefix_attention_schedule")
+_GUIDANCE = (
+    "inference_delay",
+    "executed_steps",
+    "execution_horizon",
+    "max_guidance_weight",
+    "prefix_attention_schedule",
+)
 
 
 @dataclass(frozen=True)
@@ -76,7 +82,7 @@ class Inputs:
         self._names: dict[str, str] = {}
         for key in self.expected:
             raw = [name for name, renamed in (rename_map or {}).items() if renamed == key]
-            self._names.update({name: key for name in (*_spellings(key), *raw)})
+            self._names.update(dict.fromkeys((*_spellings(key), *raw), key))
 
     def read(self, message: Mapping[str, Any], seen: Iterable[str] = ()) -> Request:
         """The request in a message. seen: keys that may be missing now, since the session has sent them before: a camera fails.

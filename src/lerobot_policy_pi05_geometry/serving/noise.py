@@ -17,8 +17,6 @@ def request_noise(seed: int, session: str, request: int, shape: tuple[int, int])
     """
     key = hashlib.sha256(f"{seed}/{session}".encode()).digest()[:16]
     generator = np.random.Generator(
-        np.random.Philox(
-            key=np.frombuffer(key, dtype=np.uint64), counter=np.array([0, 0, 0, request], dtype=np.uint64)
-        )
+        np.random.Philox(key=np.frombuffer(key, dtype=np.uint64), counter=np.array([0, 0, 0, request], dtype=np.uint64))
     )
     return torch.from_numpy(generator.standard_normal(shape, dtype=np.float32))

@@ -1,7 +1,7 @@
 """openpi's websocket protocol: one session per connection, one request of it at a time.
 
-The event loop only reads, checks and writes frames; what computes is the worker's thread. So keepalives are answered however long a
-chunk takes.
+The event loop only reads, checks and writes frames; what computes is the worker's thread. So keepalives are answered however
+long a chunk takes.
 """
 
 import asyncio
@@ -78,11 +78,14 @@ class WebsocketServer:
                 self._worker.start()
                 warm = asyncio.ensure_future(asyncio.to_thread(self._worker.wait_until_warm))
                 stopped = asyncio.ensure_future(stop.wait())
-                await asyncio.wait({warm, stopped}, return_when=asyncio.FIRST_COMPLETED)
-                if warm.done():
-                    warm.result()
-                    logger.info("Warm: requests are answered.")
-                await stopped
+                try:
+                    await asyncio.wait({warm, stopped}, return_when=asyncio.FIRST_COMPLETED)
+                    if warm.done():
+                        warm.result()
+                        logger.info("Warm: requests are answered.")
+                    await stopped
+                finally:
+                    stopped.cancel()
                 await self._drain(drain_seconds)
         finally:
             await asyncio.to_thread(self._worker.close)

@@ -1,8 +1,8 @@
 """openpi's frames: one msgpack map each, arrays as `{__ndarray__: true, data, dtype, shape}`.
 
 Facts of the format: https://github.com/Physical-Intelligence/openpi, packages/openpi-client (its keys of arrays are msgpack
-binaries; a client in another language may send strings). A frame is walked once without building anything, which bounds its values,
-their nesting and the length of every string; msgpack decodes it only then. dtypes are looked up in a list, never parsed.
+binaries; a client in another language may send strings). A frame is walked once without building anything, which bounds its
+values, their nesting and the length of every string; msgpack decodes it only then. dtypes are looked up in a list, never parsed.
 """
 
 import struct
@@ -37,7 +37,7 @@ def encode(message: dict[str, Any]) -> bytes:
 
 
 def decode(frame: bytes, limits: Limits) -> dict[str, Any]:
-    """The map in a frame. Arrays are read-only views of it. Raises RequestError, and allocates nothing beyond the frame's size."""
+    """The map in a frame, with read-only arrays. Raises RequestError. Allocates no more than some times the frame's size."""
     if len(frame) > limits.frame_bytes:
         raise RequestError(f"The frame has {len(frame)} bytes; at most {limits.frame_bytes} are accepted.")
     check_frame(frame, limits)

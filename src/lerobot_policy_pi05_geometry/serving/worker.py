@@ -1,7 +1,7 @@
 """The one thread that computes, and the queue before it.
 
-What waits when the thread is free is served together, as far as it can share a batch; nothing waits for others to come. A batch that
-fails is computed again one by one, so that one bad observation is its own client's error and nobody else's.
+What waits when the thread is free is served together, as far as it can share a batch; nothing waits for others to come. A batch
+that fails is computed again one by one, so that one bad observation is its own client's error and nobody else's.
 """
 
 import logging

@@ -1,0 +1,180 @@
+"""A served chunk is the local one, alone or in company."""
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+
+from lerobot_policy_pi05_geometry.serving.engine import Job, PolicyEngine, make_job, note_answer
+from lerobot_policy_pi05_geometry.serving.inputs import Inputs
+from lerobot_policy_pi05_geometry.serving.limits import Limits, RequestError
+from lerobot_policy_pi05_geometry.serving.noise import request_noise
+from lerobot_policy_pi05_geometry.serving.session import Session
+from tests.entry_points import ACTION_DIM, CHUNK
+
+from .running import load, local_chunk, make_request
+
+SHAPE = (CHUNK, 8)
+
+
+def read(loaded, request):
+    return Inputs(loaded.policy.config, Limits()).read(request)
+
+
+def jobs_of(loaded, requests, sessions=None):
+    sessions = sessions or [Session(name=f"robot {i}") for i in range(len(requests))]
+    return [make_job(s, read(loaded, r), 7, SHAPE) for s, r in zip(sessions, requests, strict=True)]
+
+
+@pytest.mark.parametrize("source", ["rgbd", "none", "random"])
+def test_alone_it_is_the_local_chunk_bit_for_bit(source):
+    loaded = load(geometry_source=source)
+    engine = PolicyEngine(loaded)
+    for seed in range(2):
+        request = make_request(seed)
+        if source != "rgbd":
+            request = {k: v for k, v in request.items() if k not in ("depth", "extrinsics")}
+        (job,) = jobs_of(loaded, [request])
+        (answer,) = engine.run([job], 1)
+        if source != "rgbd":
+            request = make_request(seed)  # what a local run is given; it looks at no depth
+        chunk, actions = local_chunk(loaded, [request], job.noise[None])
+        assert torch.equal(answer.chunk, chunk[0])
+        np.testing.assert_array_equal(answer.actions, actions[0].numpy())
+        assert answer.actions.shape == (CHUNK, ACTION_DIM)
+
+
+@pytest.mark.parametrize("size", [3, 4])
+def test_in_a_batch_it_is_the_local_chunk_to_rounding(size):
+    loaded = load()
+    engine, requests = PolicyEngine(loaded), [make_request(seed, f"task {seed} " * seed) for seed in range(3)]
+    jobs = jobs_of(loaded, requests)
+    answers = engine.run(jobs, size)
+    assert [answer.batch for answer in answers] == [3, 3, 3]
+    for job, request, answer in zip(jobs, requests, answers, strict=True):
+        _, actions = local_chunk(loaded, [request], job.noise[None])
+        np.testing.assert_allclose(answer.actions, actions[0].numpy(), atol=1e-5)
+    assert np.abs(answers[0].actions - answers[1].actions).max() > 0.1
+
+
+def test_noise_follows_session_and_request():
+    def draw(seed=0, session="a", request=0):
+        return request_noise(seed, session, request, (50, 32))
+
+    assert torch.equal(draw(), draw())
+    for other in (draw(seed=1), draw(session="b"), draw(request=1)):
+        assert (other - draw()).abs().mean() > 0.5
+    assert abs(draw().mean()) < 0.1
+    assert abs(draw().std() - 1) < 0.1
+
+
+def test_noise_counts_the_requests_of_a_session_over_its_episodes():
+    loaded, request = load(), make_request()
+    engine, session = PolicyEngine(loaded), Session(name="robot")
+    drawn = []
+    for _ in range(3):
+        (job,) = jobs_of(loaded, [request], [session])
+        drawn.append(job.noise)
+        note_answer(session, job.request, engine.run([job], 1)[0])
+        session.reset()
+    assert torch.equal(drawn[2], request_noise(7, "robot", 2, SHAPE))
+    assert len({tuple(noise.flatten().tolist()) for noise in drawn}) == 3
+
+
+def test_noise_that_the_client_sends_is_used():
+    loaded, noise = load(), np.random.default_rng(0).standard_normal(SHAPE, dtype=np.float32)
+    (job,) = jobs_of(loaded, [make_request() | {"noise": noise}])
+    assert torch.equal(job.noise, torch.from_numpy(noise))
+
+
+@pytest.mark.parametrize("relative", [False, True])
+@pytest.mark.parametrize("company", [False, True])
+def test_real_time_chunking_continues_the_last_chunk_as_a_local_run_does(relative, company):
+    loaded = load(use_relative_actions=relative)
+    engine, session = PolicyEngine(loaded), Session(name="robot")
+    (first,) = jobs_of(loaded, [make_request(0)], [session])
+    note_answer(session, first.request, engine.run([first], 1)[0])
+    last, absolute = session.chunk, session.absolute
+    guided = make_request(1) | {"inference_delay": 2, "executed_steps": 3}
+    (job,) = jobs_of(loaded, [guided], [session])
+    assert job.left_over is not None
+    answer = engine.run([job, job] if company else [job], 2 if company else 1)[-1]
+    assert loaded.policy.rtc_processor is None  # other requests are not guided
+
+    policy = loaded.policy
+    policy.config.rtc_config = RTCConfig()
+    policy.init_rtc_processor()
+    left_over = last[3:]
+    if relative:  # relative to the state of the new request; the engine asks LeRobot for it
+        from lerobot.policies.rtc.relative import reanchor_relative_rtc_prefix
+
+        state = torch.from_numpy(guided["state"])
+        step = next(s for s in loaded.preprocess.steps if type(s).__name__ == "RelativeActionsProcessorStep")
+        normalizer = next(s for s in loaded.preprocess.steps if type(s).__name__ == "NormalizerProcessorStep")
+        left_over = reanchor_relative_rtc_prefix(absolute[3:], state, step, normalizer, "cpu")
+        assert (left_over - last[3:]).abs().max() > 0.01
+    _, actions = local_chunk(loaded, [guided], job.noise[None], inference_delay=2, prev_chunk_left_over=left_over[None])
+    np.testing.assert_allclose(answer.actions, actions[0].numpy(), atol=1e-5)
+    policy.config.rtc_config = None
+    policy.init_rtc_processor()
+    _, free = local_chunk(loaded, [guided], job.noise[None])
+    assert np.abs(answer.actions - free[0].numpy()).max() > 0.01
+
+
+def test_a_new_episode_continues_nothing():
+    loaded, session = load(), Session()
+    engine = PolicyEngine(loaded)
+    (job,) = jobs_of(loaded, [make_request()], [session])
+    note_answer(session, job.request, engine.run([job], 1)[0])
+    guided = make_request() | {"inference_delay": 0, "executed_steps": 1}
+    assert jobs_of(loaded, [guided], [session])[0].left_over is not None
+    executed = make_request() | {"inference_delay": 0, "executed_steps": CHUNK}
+    assert jobs_of(loaded, [executed], [session])[0].left_over is None
+    session.reset()
+    assert jobs_of(loaded, [guided], [session])[0].left_over is None
+
+
+def test_jobs_share_a_batch_only_with_the_same_keys_shapes_and_guidance():
+    loaded = load()
+    base, other = make_request(0), make_request(1)
+    smaller = other | {"images": other["images"] | {"front": other["images"]["front"][1:]}}
+    floats = other | {"depth": other["depth"] | {"wrist": other["depth"]["wrist"].astype(np.float32)}}
+    posed = other | {"extrinsics": other["extrinsics"] | {"front": np.eye(4)}}
+    same, *different = (jobs_of(loaded, [r])[0].group for r in (other, smaller, floats, posed))
+    assert same == jobs_of(loaded, [base])[0].group
+    assert all(group != same for group in different)
+
+
+def test_an_implausible_unit_is_the_requests_error_at_the_start_of_an_episode():
+    loaded = load()
+    engine, request = PolicyEngine(loaded), make_request()
+    metres = request | {"depth": {name: array / np.float32(1000) for name, array in request["depth"].items()}}
+    engine.run(jobs_of(loaded, [request]), 1)
+    with pytest.raises(ValueError, match="the unit is probably wrong"):
+        engine.run(jobs_of(loaded, [metres]), 1)
+
+
+def test_actions_that_are_not_finite_are_never_sent():
+    loaded = load()
+    (job,) = jobs_of(loaded, [make_request()])
+    with pytest.raises(RequestError, match="not finite"):
+        PolicyEngine(loaded).run([job._replace(noise=torch.full(SHAPE, float("inf")))], 1)
+
+
+def test_warming_up_runs_every_size_and_leaves_nothing_behind():
+    loaded = load()
+    engine, seen = PolicyEngine(loaded), []
+    inputs = Inputs(loaded.policy.config, Limits())
+    predict = loaded.policy.predict_action_chunk
+
+    def note(batch, **how):
+        seen.append(batch["observation.state"].shape[0])
+        return predict(batch, **how)
+
+    loaded.policy.predict_action_chunk = note
+    engine.warm(inputs, (1, 2))
+    assert set(seen) == {1, 2}
+    (job,) = jobs_of(loaded, [make_request()])
+    assert isinstance(job, Job)
+    _, actions = local_chunk(loaded, [make_request()], job.noise[None])
+    np.testing.assert_array_equal(engine.run([job], 1)[0].actions, actions[0].numpy())

@@ -1,0 +1,161 @@
+"""Requests in every spelling of keys, and what is refused."""
+
+import numpy as np
+import pytest
+from lerobot.configs import RTCAttentionSchedule
+
+from lerobot_policy_pi05_geometry.serving.inputs import Guidance, Inputs
+from lerobot_policy_pi05_geometry.serving.limits import Limits, RequestError
+from tests.entry_points import FRONT, FRONT_DEPTH, STATE, WRIST, WRIST_DEPTH, WRIST_POSE, make_config, without
+
+from .running import make_request
+
+FRONT_POSE = "observation.calibration.front.extrinsics"
+
+
+def make_inputs(rename_map=None, **changes) -> Inputs:
+    config = make_config(**changes)
+    config.validate_features()
+    return Inputs(config, Limits(), rename_map)
+
+
+def flat(request: dict) -> dict:
+    """The same request as LeRobot spells it."""
+    return {
+        FRONT: request["images"]["front"],
+        WRIST: request["images"]["wrist"],
+        FRONT_DEPTH: request["depth"]["front"],
+        WRIST_DEPTH: request["depth"]["wrist"],
+        WRIST_POSE: request["extrinsics"]["wrist"],
+        STATE: request["state"],
+        "task": request["prompt"],
+    }
+
+
+def slashed(request: dict) -> dict:
+    """As openpi's examples for DROID and LIBERO spell it; depth among the images, channels first or last."""
+    return {
+        "observation/front": request["images"]["front"].transpose(2, 0, 1),
+        "observation/wrist": request["images"]["wrist"],
+        "images": {"front_depth": request["depth"]["front"][..., None], "wrist_depth": request["depth"]["wrist"][None]},
+        "extrinsics": {"wrist": request["extrinsics"]["wrist"].astype(np.float64)},
+        "observation/state": request["state"].astype(np.float64),
+        "prompt": request["prompt"],
+    }
+
+
+@pytest.mark.parametrize("spelled", [flat, slashed])
+def test_all_spellings_mean_the_same(spelled):
+    inputs, request = make_inputs(), make_request()
+    expected, found = inputs.read(request), inputs.read(spelled(request))
+    assert found.task == expected.task == request["prompt"]
+    assert set(found.observation) == set(expected.observation) == {FRONT, WRIST, *list(flat(request))[2:6]}
+    for key, array in expected.observation.items():
+        assert found.observation[key].dtype == array.dtype, key
+        np.testing.assert_array_equal(found.observation[key], array, err_msg=key)
+
+
+def test_names_of_the_data_that_the_preprocessor_renames():
+    inputs, request = make_inputs({"observation.images.top": FRONT}), flat(make_request())
+    request["observation.images.top"] = request.pop(FRONT)
+    assert FRONT in inputs.read(request).observation
+
+
+def change(request: dict, *path: str, value) -> dict:
+    name, *rest = path
+    return request | {name: change(request[name], *rest, value=value) if rest else value}
+
+
+image, depth = np.zeros((30, 40, 3), np.uint8), np.zeros((18, 24), np.uint16)
+state, nan_state = np.zeros(7, np.float32), np.full(7, np.nan, np.float32)
+WRONG = {
+    "no image": (lambda r: r | {"images": without(r["images"], "front")}, f"has no {FRONT}; expected"),
+    "no state": (lambda r: without(r, "state"), f"has no {STATE}"),
+    "no depth": (lambda r: r | {"depth": without(r["depth"], "front")}, f"has no {FRONT_DEPTH}; expected .* mm"),
+    "no pose": (lambda r: without(r, "extrinsics"), f"has no {WRIST_POSE}"),
+    "no task": (lambda r: without(r, "prompt"), "must say what to do"),
+    "two tasks": (lambda r: r | {"task": "a"}, "must say what to do in one text"),
+    "task of bytes": (lambda r: r | {"prompt": b"a"}, "must say what to do"),
+    "task of a mile": (lambda r: r | {"prompt": "ä" * 2049}, "more than 4096 bytes"),
+    "twice": (lambda r: r | {"observation.state": r["state"]}, f"{STATE} twice"),
+    "unknown": (lambda r: r | {"images": r["images"] | {"left": image}}, "has images/left, which .* does not know; it takes"),
+    "unknown and long": (lambda r: r | {"x" * 500: 1}, r"has x{77}\.\.\., which"),
+    "bytes as key": (lambda r: r | {b"a": 1}, "must be text"),
+    "bytes as inner key": (lambda r: r | {"images": {b"front": image}}, "keys in images must be text"),
+    "image of floats": (lambda r: change(r, "images", "front", value=image.astype("f8")), "dtype <f8; expected .*u1 or <f4"),
+    "image above 1": (lambda r: change(r, "images", "front", value=image.astype("f4") + 2), "outside 0 to 1"),
+    "image of NaN": (lambda r: change(r, "images", "front", value=image.astype("f4") * np.nan), "not finite"),
+    "image without channels": (lambda r: change(r, "images", "front", value=image[..., 0]), r"shape \(30, 40\)"),
+    "image with 4 channels": (lambda r: change(r, "images", "front", value=np.zeros((30, 40, 4), "u1")), "shape"),
+    "image of a batch": (lambda r: change(r, "images", "front", value=image[None]), r"shape \(1, 30, 40, 3\)"),
+    "huge image": (lambda r: change(r, "images", "front", value=np.zeros((1, 5000, 3), "u1")), "shape"),
+    "image of numbers": (lambda r: change(r, "images", "front", value=[1, 2]), "images/front is no array"),
+    "8-bit depth": (lambda r: change(r, "depth", "front", value=depth.astype("u1")), "dtype |u1; expected .* mm"),
+    "small depth": (lambda r: change(r, "depth", "front", value=depth[1:]), r"shape \(17, 24\); expected \(18, 24\)"),
+    "short state": (lambda r: r | {"state": state[1:]}, r"shape \(6,\); expected \(7,\)"),
+    "whole state": (lambda r: r | {"state": state.astype("i4")}, "dtype <i4"),
+    "lost state": (lambda r: r | {"state": nan_state}, "state holds a number that is not finite"),
+    "infinite state": (lambda r: r | {"state": np.full(7, 1e300)}, "not finite"),
+    "half a pose": (lambda r: change(r, "extrinsics", "wrist", value=np.eye(3)), "expected .*base_T_camera"),
+    "noise": (lambda r: r | {"noise": np.zeros((6, 5), np.float32)}, r"noise must be finite float32 of shape \(6, 8\)"),
+    "half of RTC": (lambda r: r | {"inference_delay": 1}, "needs executed_steps"),
+    "RTC by truth": (lambda r: r | {"inference_delay": True, "executed_steps": 1}, "needs inference_delay"),
+    "RTC beyond the chunk": (lambda r: r | {"inference_delay": 1, "executed_steps": 7}, "from 0 to 6"),
+    "no horizon": (lambda r: r | {"inference_delay": 1, "executed_steps": 1, "execution_horizon": 0}, "execution_horizon"),
+    "weight of NaN": (
+        lambda r: r | {"inference_delay": 1, "executed_steps": 1, "max_guidance_weight": float("nan")},
+        "max_guidance_weight",
+    ),
+    "schedule": (
+        lambda r: r | {"inference_delay": 1, "executed_steps": 1, "prefix_attention_schedule": "steep"},
+        "one of zeros, ones, linear, exp",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_what_is_wrong_is_named_in_one_sentence(name):
+    spoil, sentence = WRONG[name]
+    with pytest.raises(RequestError, match=sentence) as caught:
+        make_inputs().read(spoil(make_request()))
+    assert len(str(caught.value)) < 600
+    assert "\n" not in str(caught.value)
+
+
+def test_a_depth_camera_may_fail_once_it_has_been_seen():
+    inputs, request = make_inputs(), without(make_request(), "depth", "extrinsics")
+    request["depth"] = {"front": depth}
+    found = inputs.read(request, seen={WRIST_DEPTH, WRIST_POSE})
+    assert set(found.observation) == {FRONT, WRIST, FRONT_DEPTH, STATE}
+    with pytest.raises(RequestError, match=f"has no {FRONT}"):
+        inputs.read(without(request, "images"), seen={FRONT, WRIST, WRIST_DEPTH, WRIST_POSE})
+
+
+def test_an_rgb_camera_that_may_be_absent():
+    inputs = make_inputs(absent_cameras=[WRIST])
+    request = make_request()
+    assert WRIST not in inputs.read(request | {"images": without(request["images"], "wrist")}).observation
+
+
+def test_a_pose_that_the_calibration_has_may_be_sent_too():
+    request = make_request()
+    found = make_inputs().read(request | {"extrinsics": request["extrinsics"] | {"front": np.eye(4)}})
+    assert found.observation[FRONT_POSE].dtype == np.float32
+
+
+def test_without_geometry_no_depth_is_expected():
+    inputs = make_inputs(geometry_source="none")
+    assert set(inputs.expected) == {FRONT, WRIST, STATE}
+    with pytest.raises(RequestError, match="depth/front, which this policy does not know"):
+        inputs.read(make_request())
+
+
+def test_real_time_chunking():
+    given = {"inference_delay": 2, "executed_steps": 3}
+    assert make_inputs().read(make_request() | given).guidance == Guidance(2, 3)
+    more = {"execution_horizon": 4, "max_guidance_weight": 5, "prefix_attention_schedule": "exp"}
+    assert make_inputs().read(make_request() | given | more).guidance == Guidance(
+        2, 3, 4, 5.0, RTCAttentionSchedule.EXP
+    )
+    assert make_inputs().read(make_request()).guidance is None
