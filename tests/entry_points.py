@@ -65,8 +65,9 @@ def make_config(**changes: Any) -> PI05GeometryConfig:
 def redraw(policy: PI05GeometryPolicy, seed: int = 0) -> PI05GeometryPolicy:
     """Draw every parameter anew: a fresh network's zeros and ones hide errors."""
     generator = torch.Generator().manual_seed(seed)
-    for parameter in policy.parameters():
-        parameter.copy_(0.15 * torch.randn(parameter.shape, generator=generator))
+    for name, parameter in policy.named_parameters():
+        drawn = 0.15 * torch.randn(parameter.shape, generator=generator)
+        parameter.copy_(drawn.exp() if name.endswith(".openness") else drawn)
     return policy
 
 

@@ -52,8 +52,8 @@ def test_conversion_and_back(tmp_path):
         "front,wrist",
         "--geometry-grid",
         "5",
-        "--geometry-gate",
-        "-9",
+        "--geometry-gate-openness",
+        "0.01",
         "--features-from-data",
     ]
     for arguments in (["convert", str(source), str(policy), *options], ["export", str(policy), str(back)]):
@@ -61,6 +61,6 @@ def test_conversion_and_back(tmp_path):
         assert result.exit_code == 0, result.output
     config = json.loads((policy / "config.json").read_text())
     assert config["geometry_cameras"] == ["front", "wrist"]
-    assert (config["geometry_grid"], config["geometry_gate_init"], config["input_features"]) == (5, -9, {})
+    assert (config["geometry_grid"], config["geometry_gate_openness"], config["input_features"]) == (5, 0.01, {})
     assert json.loads((back / "config.json").read_text())["type"] == "pi05"
     assert "there already" in fail("export", str(policy), str(back))

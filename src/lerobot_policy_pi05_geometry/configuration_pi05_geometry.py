@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, get_args
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.optim import AdamWConfig
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
@@ -13,7 +13,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from .data.prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
 from .geometry.camera import CameraCalibration
 from .geometry.depth import METRES_PER_UNIT, MIN_DEPTH
-from .geometry.keys import DEPTH_SUFFIX, is_geometry_key
+from .geometry.keys import DEPTH_SUFFIX, camera_of, is_geometry_key
 from .model.config import (
     GeometryExpert,
     GeometryPlacement,
@@ -25,7 +25,9 @@ from .model.config import (
 )
 from .model.precision import DTYPES
 from .model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
+from .training.dropout import DropoutRates
 from .training.optim import OPTIMIZERS, AdamW8bitConfig
+from .training.schedule import GateAwareScheduleConfig
 
 logger = logging.getLogger(__name__)
 
@@ -79,8 +81,15 @@ class PI05GeometryConfig(PreTrainedConfig):
     geometry_positions: str = "sequential"  # rotary positions: sequential, or parallel (the suffix as in π0.5)
     geometry_placement: str = "segment"  # a segment of its own, or in the VLM's prefix (comparison)
     geometry_expert: str = "shared"  # the action expert's weights, or an own expert
-    geometry_gate_init: float = 0.0  # log-gate at the start: 0 open, -16 closed (what `pi05-geometry convert` writes)
-    geometry_dropout: float = 0.1  # probability that a training sample's whole geometry is masked
+    geometry_gate_openness: float = (
+        1.0  # of the gate at the start: 1 open, 1e-7 shut (what `pi05-geometry convert` writes)
+    )
+    geometry_gate_init: float | None = None  # a log-gate, in checkpoints of earlier versions: refused
+    # Probabilities that a training sample goes without a modality: all its geometry masked, all its images, or one camera (its
+    # image and its geometry). One draw decides, so a sample never loses more than one, nor the last thing it sees by.
+    geometry_dropout: float = 0.2
+    image_dropout: float = 0.3
+    camera_dropout: float = 0.0
     depth_unit: str = "mm"  # unit of the depth that arrives: mm (LeRobot's default) or m
     max_depth: float = 10.0  # metres; farther counts as not measured
     calibration_path: str | None = None  # JSON file; None: calibration.json in the dataset's meta folder
@@ -151,11 +160,11 @@ class PI05GeometryConfig(PreTrainedConfig):
     optimizer_weight_decay: float = 0.01
     optimizer_grad_clip_norm: float = 1.0
     # The new parameters (adapter with its embeddings, gate): π0.5's rate is for fine-tuning. No weight decay, which would
-    # open a negative gate. Adam moves the gate by about its rate each step: after the warm-up, 16 units take 16,000 steps at
-    # 1e-3 and 1,600 at 1e-2, which is what `pi05-geometry convert` writes.
+    # shut the gate. Adam moves the gate by at most about its rate each step, and LeRobot fits the schedule to --steps: from shut
+    # to open takes some 40 steps of one sign at 5e-2. `pi05-geometry convert` writes 3e-3 and 5e-2.
     geometry_lr: float = 1e-3
     geometry_gate_lr: float = 1e-3
-    geometry_eps: float = 1e-12  # a closed gate scales the adapter's gradients down
+    geometry_eps: float = 1e-12  # a gate that is shut scales the adapter's gradients down
 
     scheduler_warmup_steps: int = 1_000
     scheduler_decay_steps: int = 30_000
@@ -168,6 +177,7 @@ class PI05GeometryConfig(PreTrainedConfig):
                 raise ValueError(f"--policy.{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
         if self.geometry_source == "da3" and self.da3_encoder is None:
             self.da3_encoder = DEFAULT_ENCODER
+        self._refuse_log_gate()
         self._check_numbers()
         self.network()  # names variants that do not belong together
 
@@ -185,11 +195,12 @@ class PI05GeometryConfig(PreTrainedConfig):
             raise ValueError("geometry_cameras is empty; name a camera, or set geometry_source=none.")
         if self.n_action_steps > self.chunk_size:
             raise ValueError(f"n_action_steps ({self.n_action_steps}) must not exceed chunk_size ({self.chunk_size}).")
-        if not 0 <= self.geometry_dropout < 1:
-            raise ValueError(f"geometry_dropout must be in [0, 1), got {self.geometry_dropout}.")
+        self._check_dropout()
+        if not 0 <= self.geometry_gate_openness < float("inf"):
+            raise ValueError(f"geometry_gate_openness must be 0 or more, got {self.geometry_gate_openness}.")
         if self.geometry_placement == "prefix":
             fixed = {"geometry_time": "clean", "geometry_positions": "sequential", "geometry_expert": "shared"}
-            for name, value in {**fixed, "geometry_gate_init": 0.0}.items():
+            for name, value in {**fixed, "geometry_gate_openness": 1.0}.items():
                 if getattr(self, name) != value:
                     raise ValueError(
                         f"geometry_placement=prefix puts geometry among the VLM's own tokens, where {name} has no meaning; "
@@ -200,6 +211,32 @@ class PI05GeometryConfig(PreTrainedConfig):
         if self.image_resolution[0] != self.image_resolution[1]:
             raise ValueError(f"image_resolution must be square, got {tuple(self.image_resolution)}.")
 
+    def _check_dropout(self) -> None:
+        names = ("geometry_dropout", "image_dropout", "camera_dropout")
+        rates = {name: getattr(self, name) for name in names}
+        for name, rate in rates.items():
+            if not 0 <= rate < 1:
+                raise ValueError(f"{name} must be in [0, 1), got {rate}.")
+        if sum(rates.values()) > 1 + 1e-9:
+            told = ", ".join(f"{name} {rate}" for name, rate in rates.items())
+            raise ValueError(
+                f"One draw decides what a training sample goes without, so {told} must not exceed 1 together."
+            )
+
+    def _refuse_log_gate(self) -> None:
+        """Raise ValueError for a configuration of an earlier version, whose gate was a logarithm, where it has a gate."""
+        if (
+            self.geometry_gate_init is not None
+            and self.geometry_source != "none"
+            and self.geometry_placement == "segment"
+        ):
+            raise ValueError(
+                "This checkpoint is of an earlier version, whose gate was stored as a logarithm (geometry_gate_init); write a "
+                "new one with `pi05-geometry convert CHECKPOINT OUTPUT` and train that by --policy.path, since the state of its "
+                "optimiser does not carry over."
+            )
+        self.geometry_gate_init = None
+
     def network(self) -> NetworkConfig:
         """The part of this that the network has to know."""
         geometry = None
@@ -209,7 +246,7 @@ class PI05GeometryConfig(PreTrainedConfig):
                 positions=self.geometry_positions,  # type: ignore[arg-type]
                 placement=self.geometry_placement,  # type: ignore[arg-type]
                 expert=self.geometry_expert,  # type: ignore[arg-type]
-                gate_init=self.geometry_gate_init,
+                openness=self.geometry_gate_openness,
             )
         return NetworkConfig(
             paligemma=PALIGEMMA_VARIANTS[self.paligemma_variant],
@@ -277,6 +314,11 @@ class PI05GeometryConfig(PreTrainedConfig):
                 f"The data has {action_dim} action dimensions, but max_action_dim is {self.max_action_dim}; raise it."
             )
 
+    @property
+    def dropout_rates(self) -> DropoutRates:
+        """What training samples go without, and how often."""
+        return DropoutRates(self.geometry_dropout, self.image_dropout, self.camera_dropout)
+
     def depth_cameras(self) -> dict[str, tuple[int, int]]:
         """Cameras with depth, in token order, and their (height, width)."""
         prefix = f"{OBS_IMAGES}."
@@ -297,9 +339,8 @@ class PI05GeometryConfig(PreTrainedConfig):
 
     def rgb_cameras(self) -> dict[str, str]:
         """RGB cameras that geometry looks through, in token order, and the key of their images."""
-        prefixes = f"{OBS_IMAGES}.", "observation."
         keys = sorted(key for key in self.image_features if not key.startswith(EMPTY_CAMERA))
-        found = {key.removeprefix(prefixes[0]).removeprefix(prefixes[1]): key for key in keys}
+        found = {camera_of(key): key for key in keys}
         if self.geometry_cameras is None:
             return found
         unknown = [camera for camera in self.geometry_cameras if camera not in found]
@@ -339,8 +380,8 @@ class PI05GeometryConfig(PreTrainedConfig):
             grad_clip_norm=self.optimizer_grad_clip_norm,
         )
 
-    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        return CosineDecayWithWarmupSchedulerConfig(
+    def get_scheduler_preset(self) -> GateAwareScheduleConfig:
+        return GateAwareScheduleConfig(
             peak_lr=self.optimizer_lr,
             decay_lr=self.scheduler_decay_lr,
             num_warmup_steps=self.scheduler_warmup_steps,

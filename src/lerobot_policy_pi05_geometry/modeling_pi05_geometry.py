@@ -11,6 +11,7 @@
 import logging
 from collections import deque
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,15 +33,18 @@ from .data.statistics import check_stats
 from .geometry import GeometryEncoder, GeometrySource
 from .geometry.da3 import Da3Encoder
 from .geometry.da3.weights import load_da3
+from .geometry.keys import camera_of
 from .geometry.resolve import build_source
 from .inference.sampler import ChunkSampler
 from .inference.side_stream import PendingGeometry
 from .model import PI05Pytorch
 from .model.flow_matching import FlowDraw, draw_flow
 from .model.segments import GeometryTokens
+from .training.attention_share import AttentionShare
+from .training.dropout import Cameras, drop
 from .training.lora import always_in_full, peft_targets
 from .training.micro_batches import each_of, require_whole_parameters, rows_of, sum_of
-from .training.parameter_groups import FULL_STATE
+from .training.parameter_groups import FULL_STATE, GATE_GROUP, NAME
 from .training.sharding import UNIT_CLASSES
 from .weight_files.files import find_file, require_policy_type
 from .weight_files.strict_load import load_strictly
@@ -48,6 +52,7 @@ from .weight_files.strict_load import load_strictly
 logger = logging.getLogger(__name__)
 
 GATE = ".geometry_gate."  # in the name of the gate's parameter
+_SHARE_EVERY = 20  # training steps between two looks at where the actions' attention lies
 _EVALUATION_STEP = -1  # evaluation loss draws the same noise at every training step, so that its curve is comparable
 
 
@@ -101,6 +106,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self.progress = TrainingProgress()
         self._noise_seed = torch.initial_seed()
         self._last_update: dict[str, Tensor] = {}
+        self._last_share: Tensor | None = None
         if not self.model.action_in_proj.weight.is_meta:  # from_pretrained fills the weights first
             self.to(config.device)
         self.reset()
@@ -200,15 +206,34 @@ class PI05GeometryPolicy(PreTrainedPolicy):
                 return losses.sum(dim=(1, 2)) / (valid[rows].sum(dim=1) * action_dim)
             return losses.sum() / (valid.sum() * action_dim)
 
-        loss = self._in_micro_batches(part, size, reduction)
+        share = self._attention_share()
+        with nullcontext() if share is None else share.measuring():
+            loss = self._in_micro_batches(part, size, reduction)
+        if share is not None:
+            self._last_share = share.mean()
         losses = torch.cat(seen)  # (B, S, action_dim)
         info: dict[str, Any] = {"loss": (losses.sum() / (valid.sum() * action_dim)).item()}
         info["loss_per_dim"] = (losses.sum(dim=(0, 1)) / valid.sum()).tolist()
-        gate = self.model.paligemma_with_expert.geometry_gate
-        if gate is not None:
-            info["gate_openness"] = gate.openness()
-        info.update({name: value.item() for name, value in self._last_update.items()})
+        info.update(self._geometry_info())
         return loss, info
+
+    def _geometry_info(self) -> dict[str, float]:
+        """Whether geometry is taken up, in percent: LeRobot logs three digits behind the point."""
+        gate = self.model.paligemma_with_expert.geometry_gate
+        found = dict(self._last_update)
+        if gate is not None:
+            found["gate_openness_pct"] = gate.mean_openness()
+        if self._last_share is not None:
+            found["geometry_attention_pct"] = self._last_share
+        return {name: 100 * value.item() for name, value in found.items()}
+
+    def _attention_share(self) -> AttentionShare | None:
+        """What measures the attention that actions give to geometry, in some of the training steps."""
+        network = self.model.paligemma_with_expert
+        if not self.training or self.geometry is None or network.geometry_gate is None:
+            return None
+        now = int(self.training_step) % _SHARE_EVERY == 0
+        return AttentionShare(network, self.geometry.source.num_tokens) if now else None
 
     def _in_micro_batches(self, part: Callable[[slice], Tensor], size: int, reduction: str) -> Tensor:
         """The sum of `part` over the rows of a batch, or its values put together, `micro_batch_size` rows at a time."""
@@ -228,8 +253,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         device = self.training_step.device
         images, img_masks = prepare_images(batch, self.config, device)
         embs, pad = (None, None) if self.geometry is None else self._measure(batch)
-        if pad is not None and self.training:
-            pad = pad & (draw.dropout.to(device) >= self.config.geometry_dropout)[:, None]
+        if self.training:
+            img_masks, pad = drop(draw, self.config.dropout_rates, self._cameras(), img_masks, pad)
         losses: Tensor = self.model(
             images,
             img_masks,
@@ -243,8 +268,14 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         )
         return losses.mean(dim=1) if losses.ndim == 4 else losses
 
+    def _cameras(self) -> Cameras:
+        images = [camera_of(key) for key in self.config.image_features]
+        if self.geometry is None:
+            return Cameras(images, [], across_views=False)
+        return Cameras(images, self.geometry.source.cameras, self.geometry.source.across_views)
+
     def _draw(self, batch: dict[str, Tensor], shape: torch.Size) -> FlowDraw:
-        """Noise, flow time and dropout draw, keyed by (seed, step, dataset index); by the row where there is no index."""
+        """Noise, flow time and dropout draws, keyed by (seed, step, dataset index); by the row where there is no index."""
         index = batch.get("index")
         indices = list(range(shape[0])) if index is None else [int(i) for i in index.flatten().tolist()]
         return draw_flow(
@@ -276,9 +307,10 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         common: dict[str, Any] = {"eps": self.config.geometry_eps, "weight_decay": 0.0}
         if self.config.optimizer == "adamw8bit":
             common[FULL_STATE] = True
-        for params, lr in ((rest, self.config.geometry_lr), (gate, self.config.geometry_gate_lr)):
-            if params:
-                groups.append({"params": params, "lr": lr, **common})
+        if rest:
+            groups.append({"params": rest, "lr": self.config.geometry_lr, **common})
+        if gate:
+            groups.append({"params": gate, "lr": self.config.geometry_gate_lr, NAME: GATE_GROUP, **common})
         return groups
 
     @torch.no_grad()
@@ -291,7 +323,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if before and len(before) == len(now):
             moved = torch.stack([(a - b).square().sum() for a, b in zip(now, before, strict=True)]).sum()
             size = torch.stack([b.square().sum() for b in before]).sum()
-            self._last_update = {"geometry_update": (moved / size.clamp_min(1e-12)).sqrt()}
+            self._last_update = {"geometry_update_pct": (moved / size.clamp_min(1e-12)).sqrt()}
 
     # --- acting ---------------------------------------------------------------------------------------------------
 

@@ -24,11 +24,11 @@ def test_attention_is_a_distribution_that_leaves_out_holes(policy):
     assert (attention.weights[:, prefix : prefix + geometry][pad] > 0).all()
 
 
-def test_a_closed_gate_takes_all_attention_from_geometry(policy):
-    policy.model.paligemma_with_expert.geometry_gate.log_gate.data.fill_(-1e4)
+def test_a_shut_gate_takes_the_attention_from_geometry(policy):
+    policy.model.paligemma_with_expert.geometry_gate.openness.data.fill_(0.0)
     attention = suffix_attention(policy, make_batch(2))
     prefix, geometry, _ = attention.lengths
-    assert attention.weights[:, prefix : prefix + geometry].sum() == 0
+    assert attention.weights[:, prefix : prefix + geometry].sum() < 1e-4
 
 
 def test_looking_changes_nothing_and_leaves_no_hook(policy):

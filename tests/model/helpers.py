@@ -60,7 +60,7 @@ def randomise(module: nn.Module, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in sorted(module.named_parameters()):
         drawn = torch.randn(parameter.shape, generator=generator)
-        is_matrix = parameter.ndim > 1 and "log_gate" not in name
+        is_matrix = parameter.ndim > 1 and "openness" not in name
         parameter.copy_(drawn * (parameter[0].numel() ** -0.5 if is_matrix else 0.3))
 
 

@@ -66,20 +66,20 @@ def test_the_batch_does_not_matter(members: list[int], random) -> None:
 
 
 def test_shapes_and_types() -> None:
-    """(B, S, D), (B,) and (B,), all float32."""
-    noise, time, dropout = draw(0, 0, [5, 6])
-    assert (noise.shape, time.shape, dropout.shape) == ((2, 4, 3), (2,), (2,))
-    assert {noise.dtype, time.dtype, dropout.dtype} == {torch.float32}
+    """(B, S, D), and (B,) for the rest, all float32."""
+    drawn = draw(0, 0, [5, 6])
+    assert [tuple(x.shape) for x in drawn] == [(2, 4, 3), (2,), (2,), (2,)]
+    assert {x.dtype for x in drawn} == {torch.float32}
 
 
 @pytest.mark.parametrize("vary", ["step", "index"])
 def test_distributions(vary: str) -> None:
-    """Noise is standard normal, time is Beta(1.5, 1) in [0.001, 1], dropout uniform: over steps and over samples."""
+    """Noise is standard normal, time is Beta(1.5, 1) in [0.001, 1], the rest uniform: over steps and over samples."""
     count = 4000
     if vary == "index":
-        noise, time, dropout = draw(3, 7, list(range(count)))
+        noise, time, *uniform = draw(3, 7, list(range(count)))
     else:
-        noise, time, dropout = (
+        noise, time, *uniform = (
             torch.cat(parts) for parts in zip(*(draw(3, step, [7]) for step in range(count)), strict=True)
         )
     assert abs(noise.mean()) < 0.02
@@ -89,29 +89,31 @@ def test_distributions(vary: str) -> None:
     # P(time <= t) = u^1.5 with u = (t - offset) / scale, for Beta(1.5, 1).
     for t in (0.1, 0.3, 0.5, 0.8):
         assert abs((time <= t).float().mean() - ((t - 0.001) / 0.999) ** 1.5) < 0.03
-    assert 0 <= dropout.min() < 0.01
-    assert 0.99 < dropout.max() < 1
-    for p in (0.1, 0.5, 0.9):
-        assert abs((dropout < p).float().mean() - p) < 0.03
+    for drawn in uniform:
+        assert 0 <= drawn.min() < 0.01
+        assert 0.99 < drawn.max() < 1
+        for p in (0.1, 0.5, 0.9):
+            assert abs((drawn < p).float().mean() - p) < 0.03
 
 
-def test_noise_time_and_dropout_are_independent() -> None:
+def test_the_draws_are_independent() -> None:
     """No two of the draws of a sample are correlated, and neither are those of two steps."""
-    noise, time, dropout = draw(4, 0, list(range(4000)))
+    noise, *rest = draw(4, 0, list(range(4000)))
     later = draw(4, 1, list(range(4000))).noise
-    columns = torch.stack([noise[:, 0, 0], noise[:, 1, 0], later[:, 0, 0], time, dropout])
+    columns = torch.stack([noise[:, 0, 0], noise[:, 1, 0], later[:, 0, 0], *rest])
     correlation = torch.corrcoef(columns) - torch.eye(len(columns))
     assert correlation.abs().max() < 0.06
 
 
 def test_several_flow_samples() -> None:
-    """K noises and times per observation, no two alike, and one dropout draw; keyed like a single one."""
-    noise, time, dropout = draw_flow(0, 0, [5, 6], SHAPE, **BETA, samples=3)
-    assert (noise.shape, time.shape, dropout.shape) == ((2, 3, 4, 3), (2, 3), (2,))
+    """K noises and times per observation, no two alike, and one of the other draws; keyed like a single one."""
+    drawn = draw_flow(0, 0, [5, 6], SHAPE, **BETA, samples=3)
+    assert [tuple(x.shape) for x in drawn] == [(2, 3, 4, 3), (2, 3), (2,), (2,)]
+    noise, time, *_ = drawn
     assert len(noise.unique()) == noise.numel()
     assert len(time.unique()) == time.numel()
     alone = draw_flow(0, 0, [6], SHAPE, **BETA, samples=3)
-    assert same(alone, FlowDraw(noise[1:], time[1:], dropout[1:]))
+    assert same(alone, FlowDraw(*(x[1:] for x in drawn)))
 
 
 def test_alpha_and_beta_are_used() -> None:

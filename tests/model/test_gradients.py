@@ -97,7 +97,7 @@ def test_every_entry_of_the_gate_and_of_geometry_gets_a_gradient(
     assert tokens.grad[batch.geom_pad].abs().amax(dim=-1).min() > 0
     gate = network.paligemma_with_expert.geometry_gate
     assert (gate is None) == (geometry.placement == "prefix")
-    assert gate is None or gate.log_gate.grad.abs().min() > 0
+    assert gate is None or gate.openness.grad.abs().min() > 0
 
 
 # --- DDP --------------------------------------------------------------------------------------------------------------

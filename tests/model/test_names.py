@@ -11,7 +11,7 @@ from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEM
 from .helpers import IN_PREFIX, OWN_EXPERT, SEGMENT, name_of
 
 SIZES = {"image_size": 224, "chunk_size": 50, "max_action_dim": 32}
-GATE = "paligemma_with_expert.geometry_gate.log_gate"
+GATE = "paligemma_with_expert.geometry_gate.openness"
 EXPERT, OWN = "paligemma_with_expert.gemma_expert.model.", "paligemma_with_expert.geometry_expert."
 
 Shapes = dict[str, tuple[int, ...]]
@@ -55,7 +55,7 @@ def test_no_new_names(variants: tuple[str, str], theirs: Shapes, geometry: Geome
 
 
 def test_the_segment_adds_a_gate(variants: tuple[str, str], theirs: Shapes) -> None:
-    """One log-gate per layer and head."""
+    """One openness per layer and head."""
     found = ours(variants, SEGMENT)
     expert = EXPERT_VARIANTS[variants[1]]
     assert found.pop(GATE) == (expert.depth, expert.num_heads)

@@ -1,7 +1,5 @@
 """Invariants 1 and 2: who is disturbed by whom."""
 
-import math
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -209,12 +207,12 @@ def test_cached_and_plain_outputs_agree() -> None:
 
 
 def test_the_gate_acts_on_the_suffix_alone() -> None:
-    """The log-gate changes the suffix's output, and nothing of prefix or geometry."""
+    """The gate changes the suffix's output, and nothing of prefix or geometry."""
     network = build_network(SEGMENT, seed=1)
     batch = Case(seed=10).draw(network.geometry_width)
     with torch.no_grad():
         before, _ = run_segments(network, batch, cached=False)
-        network.paligemma_with_expert.geometry_gate.log_gate += 1
+        network.paligemma_with_expert.geometry_gate.openness *= 3
         after, _ = run_segments(network, batch, cached=False)
     assert torch.equal(before[Segment.PREFIX], after[Segment.PREFIX])
     assert torch.equal(before[Segment.GEOMETRY], after[Segment.GEOMETRY])
@@ -222,9 +220,11 @@ def test_the_gate_acts_on_the_suffix_alone() -> None:
 
 
 def test_the_gate_scales_softmax_weights() -> None:
-    """exp(gate) multiplies the weight of a geometry key: a gate of log 2 counts every cell twice."""
-    gate = GeometryGate(num_layers=1, num_heads=8, init=math.log(2))
-    assert gate.openness() == pytest.approx(2.0)
+    """The openness multiplies the weight of a geometry key: 2, or -2, counts every cell twice."""
+    gate = GeometryGate(num_layers=1, num_heads=8, openness=2.0)
+    with torch.no_grad():
+        gate.openness[0, ::2] = -2.0
+    assert gate.mean_openness() == 2.0
     bias = gate(0, before=3, geometry=4, after=2)
     assert bias.shape == (8, 9)
     generator = torch.Generator().manual_seed(0)

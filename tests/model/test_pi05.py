@@ -209,10 +209,10 @@ def test_masked_geometry_is_no_geometry(geometry: GeometrySegmentConfig, case: C
 @given(case=cases)
 @settings(max_examples=6)
 def test_a_closed_gate_hides_geometry(case: Case) -> None:
-    """With the gate closed and parallel positions the network is its π0.5, so a warm start begins as that one."""
+    """With the gate shut and parallel positions the network is its π0.5, so a warm start begins as that one."""
     network = build_network(PARALLEL, seed=case.seed)
     with torch.no_grad():
-        network.paligemma_with_expert.geometry_gate.log_gate.fill_(-1e4)
+        network.paligemma_with_expert.geometry_gate.openness.fill_(0.0)
     batch = case.draw(network.geometry_width)
     assert_near(both_paths(network, batch), both_paths(network, batch.without_geometry))
 
@@ -221,7 +221,7 @@ def test_sequential_positions_move_the_actions() -> None:
     """The reason for "parallel": under "sequential" even hidden geometry moves the suffix, and so its output."""
     network = build_network(SEGMENT)
     with torch.no_grad():
-        network.paligemma_with_expert.geometry_gate.log_gate.fill_(-1e4)
+        network.paligemma_with_expert.geometry_gate.openness.fill_(0.0)
     batch = Case(seed=6).draw(network.geometry_width)
     assert distance(sample(network, batch), sample(network, batch.without_geometry)) > 1e-3
 

@@ -78,7 +78,7 @@ def test_float32_modules_stay_float32(param_dtype: torch.dtype) -> None:
         "gemma_expert.model.norm.dense.weight",
         "geometry_expert.layers.0.input_layernorm.dense.bias",
         "vision_model.post_layernorm.weight",
-        "log_gate",
+        "openness",
         "action_in_proj.weight",
         "action_out_proj.bias",
         "time_mlp_in.weight",

@@ -158,7 +158,9 @@ def test_the_loss_falls_as_with_adamw():
     """Forty steps on one batch: within a few percent of 32 bits."""
     last = {}
     for optimizer_name in ("adamw", "adamw8bit"):
-        policy = make_policy(optimizer=optimizer_name, optimizer_lr=1e-3, geometry_dropout=0.0).train()
+        policy = make_policy(
+            optimizer=optimizer_name, optimizer_lr=1e-3, geometry_dropout=0.0, image_dropout=0.0
+        ).train()
         optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
         losses = []
         for _ in range(40):

@@ -78,7 +78,9 @@ def convert(
     geometry_grid: Annotated[int, typer.Option(help="Cells per side and camera.")] = 8,
     geometry_frame: Annotated[str, typer.Option(help="Points in the robot's base frame, or camera.")] = "base",
     geometry_expert: Annotated[str, typer.Option(help="shared, or own: a copy of the action expert.")] = "shared",
-    geometry_gate: Annotated[float, typer.Option(help="Log-gate to start with; -16 is closed, 0 open.")] = -16.0,
+    geometry_gate_openness: Annotated[
+        float, typer.Option(help="Of the gate at the start: 1e-7 is shut, 1 open.")
+    ] = 1e-7,
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration file. Default: the training data's meta/calibration.json.")
     ] = None,
@@ -109,7 +111,7 @@ def convert(
         grid=geometry_grid,
         frame=geometry_frame,
         expert=geometry_expert,
-        gate=geometry_gate,
+        openness=geometry_gate_openness,
     )
     run(
         source, output, geometry, features_from_data=features_from_data, chunk_size=chunk_size,

@@ -9,6 +9,11 @@ IMAGE_PREFIX = "observation.images."
 CALIBRATION_PREFIX = "observation.calibration."
 
 
+def camera_of(image_key: str) -> str:
+    """Name of the camera whose images stand under this key."""
+    return image_key.removeprefix(IMAGE_PREFIX).removeprefix("observation.")
+
+
 def depth_key(camera: str) -> str:
     """Where the depth of a camera stands in a batch."""
     return f"{IMAGE_PREFIX}{camera}{DEPTH_SUFFIX}"

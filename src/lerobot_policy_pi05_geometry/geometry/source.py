@@ -22,13 +22,15 @@ class GeometrySource(nn.Module, ABC):
     """Turns an observation batch into per-cell features.
 
     cameras: names of the V cameras in token order. grid: cells per side. feature_dim: C. optional: cameras that any
-    observation may lack; that any other is missing is an error in training, and a failure afterwards.
+    observation may lack; that any other is missing is an error in training, and a failure afterwards. across_views: whether
+    features of one camera's cells depend on the other cameras.
     """
 
     cameras: tuple[str, ...]
     grid: int
     feature_dim: int
     optional: frozenset[str] = frozenset()
+    across_views: bool = False
 
     @property
     def num_tokens(self) -> int:

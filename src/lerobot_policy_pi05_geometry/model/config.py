@@ -23,14 +23,14 @@ class GeometrySegmentConfig:
     positions: "sequential" counts P|G|S; "parallel" gives the suffix the positions it would have without geometry.
     placement: "segment" between prefix and suffix, or "prefix" inside the VLM's own prefix (for comparison).
     expert: "shared" uses the action expert's weights, "own" a second expert that starts as its copy.
-    gate_init: log-gate that the suffix's attention logits on geometry start with; 0 is open, -16 closed.
+    openness: what the gate starts with, the factor on the suffix's softmax weight on geometry; 1 is open, 1e-7 closed.
     """
 
     time: GeometryTime = "clean"
     positions: GeometryPositions = "sequential"
     placement: GeometryPlacement = "segment"
     expert: GeometryExpert = "shared"
-    gate_init: float = 0.0
+    openness: float = 1.0
 
 
 @dataclass(frozen=True)

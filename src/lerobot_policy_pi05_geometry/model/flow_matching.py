@@ -22,7 +22,8 @@ class FlowDraw(NamedTuple):
 
     noise: Tensor  # (B, S, D) float32, standard normal; (B, K, S, D) for K > 1 flow samples
     time: Tensor  # (B,) float32 in (0, 1]; (B, K)
-    dropout: Tensor  # (B,) float32, uniform in [0, 1)
+    dropout: Tensor  # (B,) float32, uniform in [0, 1): what the sample goes without (dropout.py)
+    camera: Tensor  # (B,) float32, uniform in [0, 1): which camera, if it goes without one
 
 
 def draw_flow(
@@ -37,12 +38,12 @@ def draw_flow(
     offset: float,
     samples: int = 1,
 ) -> FlowDraw:
-    """Draw noise, flow time Beta(alpha, beta) * scale + offset, and a uniform number for each dataset index.
+    """Draw noise, flow time Beta(alpha, beta) * scale + offset, and two uniform numbers for each dataset index.
 
     seed: of the run. step: optimiser steps done so far. indices: dataset index of each of the B samples.
     shape: (S, D) of one action chunk. samples: K, noises and times per observation. Returns a `FlowDraw`.
     """
-    noise, time, dropout = [], [], []
+    noise, time, dropout, camera = [], [], [], []
     for index in indices:
         generator = np.random.Generator(
             np.random.Philox(
@@ -53,7 +54,8 @@ def draw_flow(
         noise.append(generator.standard_normal((samples, *shape), dtype=np.float32))
         time.append(generator.beta(alpha, beta, samples) * scale + offset)
         dropout.append(generator.random())
+        camera.append(generator.random())
     noises, times = torch.from_numpy(np.stack(noise)), torch.from_numpy(np.stack(time)).float()
     if samples == 1:
         noises, times = noises[:, 0], times[:, 0]
-    return FlowDraw(noises, times, torch.tensor(dropout, dtype=torch.float32))
+    return FlowDraw(noises, times, *(torch.tensor(drawn, dtype=torch.float32) for drawn in (dropout, camera)))

@@ -71,7 +71,7 @@ class PaliGemmaWithExpert(nn.Module):
         self.geometry_expert: GemmaModel | None = None
         geometry = config.geometry
         if geometry is not None and geometry.placement == "segment":
-            self.geometry_gate = GeometryGate(config.expert.depth, config.expert.num_heads, geometry.gate_init)
+            self.geometry_gate = GeometryGate(config.expert.depth, config.expert.num_heads, geometry.openness)
             if geometry.expert == "own":
                 self.geometry_expert = GemmaModel(config.expert, cond_dim=config.expert.width)
                 self.geometry_expert.load_state_dict(self.expert.state_dict())
@@ -184,7 +184,7 @@ class PaliGemmaWithExpert(nn.Module):
     def _gate_bias(
         self, layer: int, segment: Segment, embeds: Sequence[Tensor | None], cache: SegmentKVCache | None
     ) -> Tensor | None:
-        """The log-gate as an attention bias (H, K), on the suffix's queries only; None where no geometry is seen."""
+        """The gate as an attention bias (H, K), on the suffix's queries only; None where no geometry is seen."""
         if self.geometry_gate is None or segment is not Segment.SUFFIX:
             return None
         lengths = cache.lengths if cache else [0 if x is None else x.shape[1] for x in embeds]

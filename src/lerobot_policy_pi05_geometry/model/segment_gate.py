@@ -1,8 +1,13 @@
-"""How open the door between geometry and the actions is.
+"""How much of its attention the actions may give to geometry.
 
-New tokens take softmax mass from the pretrained ones, so geometry enters through a learned log-gate per layer and
-head, added to the suffix's attention logits on geometry keys: exp(gate) multiplies their softmax weight. 0 is open;
--16 leaves a token 1e-7 of its weight, so that a warm-started policy begins as the one it came from.
+New tokens take softmax mass from the pretrained ones, so the suffix's softmax weight on geometry keys is multiplied by a
+learned openness per layer and head: its logarithm is added to the attention logits. 1 is open; at 1e-7 a warm-started policy
+begins as the one it came from.
+
+The openness itself is the parameter, and not its logarithm: the gradient of a logarithm shrinks with the openness, and a
+log-gate that started at -16 was still shut after 1,500 steps of fine-tuning (docs/results.md). The magnitude is what counts, so
+a step past zero opens the gate again. Below 1e-8 the logarithm stays where it is and the gradient is passed through: log 0
+would make it NaN, and a gradient of 0 would never let go of the parameter.
 """
 
 import torch
@@ -11,19 +16,27 @@ from torch import Tensor, nn
 
 from .precision import Float32Module
 
+SMALLEST = 1e-8  # openness that the logarithm sees at least
+
 
 class GeometryGate(Float32Module):
-    """Log-gates of all layers, (layers, heads), float32. A module, so that PEFT can save it in full."""
+    """Openness of all layers and heads, (layers, heads) float32. A module, so that PEFT can save it in full."""
 
-    def __init__(self, num_layers: int, num_heads: int, init: float) -> None:
+    def __init__(self, num_layers: int, num_heads: int, openness: float) -> None:
         super().__init__()
-        self.log_gate = nn.Parameter(torch.full((num_layers, num_heads), float(init)))
+        self.openness = nn.Parameter(torch.full((num_layers, num_heads), float(openness)))
 
     def forward(self, layer: int, before: int, geometry: int, after: int) -> Tensor:
-        """Additive attention bias of one layer, (heads, before + geometry + after): the gate on geometry, 0 elsewhere."""
-        return F.pad(self.log_gate[layer][:, None].expand(-1, geometry), (before, after))
+        """Additive attention bias of one layer, (heads, before + geometry + after): log openness on geometry, else 0."""
+        return F.pad(log_openness(self.openness[layer])[:, None].expand(-1, geometry), (before, after))
 
     @torch.no_grad()
-    def openness(self) -> float:
-        """Mean of exp(gate), for logging: 1 is open, 0 is closed."""
-        return self.log_gate.exp().mean().item()
+    def mean_openness(self) -> Tensor:
+        """Mean magnitude over layers and heads, a scalar: 1 is open, 0 is shut."""
+        return self.openness.abs().mean()
+
+
+def log_openness(openness: Tensor) -> Tensor:
+    """log(max(|openness|, 1e-8)), float32, whose gradient is that of log |openness| with the magnitude clamped likewise."""
+    magnitude = torch.where(openness < 0, -openness, openness).float()  # not abs(), whose gradient at 0 is 0
+    return (magnitude + (magnitude.clamp_min(SMALLEST) - magnitude).detach()).log()

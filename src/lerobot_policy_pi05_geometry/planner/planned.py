@@ -52,7 +52,7 @@ class PlannedPolicy(PI05GeometryPolicy):
         size, steps = batch["action"].shape[:2]
         samples = () if self.config.flow_samples == 1 else (self.config.flow_samples,)
         noise = torch.zeros(size, *samples, steps, self.config.max_action_dim)
-        draw = FlowDraw(noise=noise, time=torch.zeros(size, *samples), dropout=torch.zeros(size))
+        draw = FlowDraw(noise, torch.zeros(size, *samples), dropout=torch.zeros(size), camera=torch.zeros(size))
         losses = self._losses(batch, draw)[..., : self.config.action_feature.shape[0]]
         valid = torch.ones(losses.shape[:2], dtype=torch.bool)
         return losses.masked_fill(~valid[..., None], 0.0).sum() / (whole * losses[0].numel())

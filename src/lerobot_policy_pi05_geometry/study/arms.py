@@ -38,7 +38,7 @@ ARMS = {
     "geometry": _geometry("RGB, and a geometry segment from depth: the default"),
     "random": _no_depth("RGB, and as many constant random tokens", "random"),
     "prefix": _geometry("geometry among the VLM's own tokens", geometry_placement="prefix"),
-    "gate-closed": _geometry("gate started almost closed", geometry_gate_init="-8"),
+    "gate-closed": _geometry("gate started almost shut", geometry_gate_openness="3e-4"),
     "flow-time": _geometry("segment conditioned on the current flow time", geometry_time="denoise"),
     "own-expert": _geometry("an expert of its own for geometry", geometry_expert="own"),
     "dropout": _geometry("geometry masked in half of the training samples", geometry_dropout="0.5"),

@@ -120,7 +120,7 @@ def test_settings_carry_over(lerobot_source, converted):
     assert set(theirs) - set(ours) == {"compile_model", "compile_mode"}
     assert (ours["type"], ours["device"], ours["optimizer_lr"]) == ("pi05_geometry", None, 1.25e-5)
     assert list(ours["input_features"]) == [FRONT, WRIST, STATE]
-    assert (ours["geometry_positions"], ours["geometry_gate_init"]) == ("parallel", -16.0)
+    assert (ours["geometry_positions"], ours["geometry_gate_openness"]) == ("parallel", 1e-7)
     assert ours["calibration"].keys() == {"front", "wrist"}
 
 

@@ -28,10 +28,10 @@ def test_actions_are_the_sources(policy, seed):
     """Within 1e-3 with geometry, of actions up to 4; an open gate shows that the geometry is there to be seen."""
     batch = make_batch(1 + seed % 3, seed)
     assert distance(policy, batch) < 1e-3
-    gate = policy.model.paligemma_with_expert.geometry_gate.log_gate
+    gate = policy.model.paligemma_with_expert.geometry_gate.openness
     closed = gate.detach().clone()
     try:
-        gate.data.zero_()
+        gate.data.fill_(1.0)
         assert distance(policy, batch) > 1e-2
     finally:
         gate.data.copy_(closed)
@@ -41,10 +41,10 @@ def test_actions_are_the_sources(policy, seed):
 def test_actions_with_geometry_masked_are_the_sources_exactly(policy, seed):
     batch = make_batch(1 + seed % 3, seed)
     holes = {key: torch.zeros_like(batch[key]) for key in (FRONT_DEPTH, WRIST_DEPTH)}
-    gate = policy.model.paligemma_with_expert.geometry_gate.log_gate
+    gate = policy.model.paligemma_with_expert.geometry_gate.openness
     closed = gate.detach().clone()
     try:
-        gate.data.zero_()  # it is the mask, not the gate
+        gate.data.fill_(1.0)  # it is the mask, not the gate
         assert distance(policy, batch | holes) < 1e-5
     finally:
         gate.data.copy_(closed)
@@ -73,7 +73,7 @@ def test_an_openpi_checkpoint_acts_the_same(tmp_path, two_cameras):
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_one_training_step_moves_the_gate_and_the_adapter(converted, dtype):
-    policy = load_on(converted, dtype=dtype, geometry_dropout=0.0).train()
+    policy = load_on(converted, dtype=dtype, geometry_dropout=0.0, image_dropout=0.0).train()
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     before = {name: p.detach().clone() for name, p in policy.new_parameters().items()}
     loss, _ = policy.forward(make_batch(4))
@@ -82,7 +82,7 @@ def test_one_training_step_moves_the_gate_and_the_adapter(converted, dtype):
     for name, parameter in policy.new_parameters().items():
         moved = (parameter.detach() - before[name]).abs()
         rate = policy.config.geometry_gate_lr if "gate" in name else policy.config.geometry_lr
-        # Adam's first step is the rate wherever eps does not matter: a closed gate hides no gradient from it.
+        # Adam's first step is the rate wherever eps does not matter: a shut gate hides no gradient from it.
         assert moved.median() == pytest.approx(rate, rel=0.05), name
 
 

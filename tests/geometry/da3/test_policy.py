@@ -64,7 +64,7 @@ def test_the_encoder_sees_the_raw_image_and_not_siglips(encoder):
 
 
 def test_training_moves_the_adapter_and_never_the_encoder(encoder):
-    policy, batch = make_da3(encoder, geometry_dropout=0.0).train(), make_batch()
+    policy, batch = make_da3(encoder, geometry_dropout=0.0, image_dropout=0.0).train(), make_batch()
     frozen, before = frozen_tensors(policy), {n: p.detach().clone() for n, p in policy.new_parameters().items()}
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     for _ in range(2):

@@ -31,7 +31,7 @@ def start_values(
 ) -> dict[str, StoredTensor | Tensor]:
     """Every new tensor of a policy on the meta device, by its name in the state dict.
 
-    The adapter is drawn anew, the gate as closed as configured, an own expert is a copy of the action expert.
+    The adapter is drawn anew, the gate as open as configured, an own expert is a copy of the action expert.
 
     stored: π0.5's tensors by their names in the state dict. seed: another draws another adapter.
     """
@@ -39,8 +39,8 @@ def start_values(
     network = policy.model.paligemma_with_expert
     assert isinstance(network, PaliGemmaWithExpert)
     if network.geometry_gate is not None:
-        layers, heads = network.geometry_gate.log_gate.shape
-        values |= _state(_GATE, GeometryGate(layers, heads, policy.config.geometry_gate_init))
+        layers, heads = network.geometry_gate.openness.shape
+        values |= _state(_GATE, GeometryGate(layers, heads, policy.config.geometry_gate_openness))
     if network.geometry_expert is not None:
         values |= {
             name.replace(_EXPERT, _OWN_EXPERT): tensor for name, tensor in stored.items() if name.startswith(_EXPERT)

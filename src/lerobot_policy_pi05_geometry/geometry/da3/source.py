@@ -27,6 +27,8 @@ class Da3Source(GeometrySource):
     image_size: pixels per side, a multiple of 14 * grid. optional: cameras that observations may lack.
     """
 
+    across_views = True
+
     def __init__(
         self,
         keys: Mapping[str, str],

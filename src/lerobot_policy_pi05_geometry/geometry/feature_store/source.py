@@ -18,6 +18,8 @@ class FeatureStoreSource(GeometrySource):
     (an environment that lerobot-train evaluates in). optional: cameras that observations may lack.
     """
 
+    across_views = True
+
     def __init__(
         self, store: FeatureStore, live: Callable[[], GeometrySource], optional: Set[str] = frozenset()
     ) -> None:
