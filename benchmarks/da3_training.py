@@ -261,7 +261,7 @@ def main() -> None:
         args.encoder = write_encoder(Path(folder) / "model.safetensors", args.variant)
         settings = config("da3", args.grids[0], CAMERAS[:1], args.encoder, args.image)
         encoder = load_da3(settings)
-        args.hash = settings.da3_hash
+        args.hash = encoder.content_hash
         results = []
         for grid in args.grids:
             for count in args.cameras:

@@ -7,9 +7,11 @@ import draccus
 import pytest
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.geometry.keys import is_geometry_key
+from lerobot_policy_pi05_geometry.model.ablations import AblationSettings
 from lerobot_policy_pi05_geometry.model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 from tests.entry_points import FRONT, FRONT_DEPTH, STATE, WRIST, WRIST_DEPTH, WRIST_POSE, make_calibration, make_config
 
@@ -119,25 +121,66 @@ def depth_feature(flag: str) -> dict:
     return {"dtype": "image", "shape": (8, 8, 1), "names": ["height", "width", "channels"], "info": {flag: True}}
 
 
+def rgb_feature() -> dict:
+    return {"dtype": "image", "shape": (8, 8, 3), "names": ["height", "width", "channels"], "info": None}
+
+
+def found_in(features: dict, **changes) -> PI05GeometryConfig:
+    """A fresh configuration after LeRobot's `make_policy` has told it a dataset's features."""
+    config = make_config(input_features=dataset_to_policy_features(features), **changes)
+    config.set_dataset_feature_metadata(features)
+    config.validate_features()
+    return config
+
+
 @pytest.mark.parametrize("flag", ["is_depth_map", "video.is_depth_map"])
-@pytest.mark.parametrize("key", ["observation.images.front_range", "observation.front_depth", "observation.depth"])
-def test_a_depth_map_under_a_name_that_the_policy_does_not_know_is_reported(flag, key, caplog):
-    """It would pass for an RGB camera."""
-    make_config().set_dataset_feature_metadata({key: depth_feature(flag)})
-    (record,) = caplog.records
-    assert f"{key} is a depth map" in record.getMessage()
-    assert "rename it to observation.images.<camera>_depth" in record.getMessage()
+@pytest.mark.parametrize(
+    ("key", "camera"),
+    [
+        ("observation.images.depth.front", "front"),
+        ("observation.depth_front", "front"),
+        ("observation.images.front.depth", "front"),
+        ("observation.front_depth", "front"),
+        ("observation.images.front_range", "front_range"),
+        ("observation.depth", "depth"),
+        (FRONT_DEPTH, "front"),
+        ("observation.images.my_depth_cam_depth", "my_depth_cam"),
+    ],
+)
+def test_a_depth_map_is_found_by_its_flag_whatever_its_name(flag, key, camera):
+    config = found_in({key: depth_feature(flag), FRONT: rgb_feature()})
+    assert config.depth_cameras() == {camera: (8, 8)}
+    assert set(config.image_features) == {FRONT}
+    assert set(config.geometry_features) == {key}
 
 
-def test_depth_maps_by_their_known_name_and_other_features_pass(caplog):
-    make_config().set_dataset_feature_metadata(
-        {
-            FRONT_DEPTH: depth_feature("is_depth_map"),
-            FRONT: {"dtype": "image", "shape": (8, 8, 3), "names": None, "info": None},
-            STATE: {"dtype": "float32", "shape": (7,), "names": None},
-        }
-    )
-    assert not caplog.records
+def test_a_given_key_needs_no_flag_and_names_the_camera():
+    unflagged = depth_feature("is_depth_map") | {"info": None}
+    config = found_in({"observation.range_2": unflagged}, depth_keys={"wrist": "observation.range_2"})
+    assert config.depth_cameras() == {"wrist": (8, 8)}
+
+
+def test_two_depth_maps_of_one_camera_are_refused():
+    flagged = depth_feature("is_depth_map")
+    for other in (FRONT_DEPTH, "observation.images.depth.front"):
+        with pytest.raises(ValueError, match=r"would both belong to camera 'front'; name their cameras") as caught:
+            found_in({other: flagged, "observation.depth_front": flagged})
+        one_sentence(caught.value)
+    keys = {"front": FRONT_DEPTH, "second": "observation.depth_front"}
+    assert set(found_in(dict.fromkeys(keys.values(), flagged), depth_keys=keys).depth_cameras()) == set(keys)
+
+
+def test_a_policy_that_has_its_cameras_keeps_them():
+    config = make_config()
+    config.validate_features()
+    config.set_dataset_feature_metadata({"observation.depth_front": depth_feature("is_depth_map")})
+    assert config.depth_keys == {}
+
+
+def test_a_colourised_depth_video_stays_an_rgb_camera():
+    config = found_in({FRONT_DEPTH: rgb_feature(), WRIST_DEPTH: depth_feature("is_depth_map")})
+    assert set(config.image_features) == {FRONT_DEPTH}
+    assert set(config.depth_cameras()) == {"wrist"}
 
 
 # --- saving -------------------------------------------------------------------------------------------------------
@@ -235,6 +278,19 @@ def test_bad_numbers_are_refused_in_one_sentence(changes, said):
     with pytest.raises(ValueError, match=said) as caught:
         make_config(**changes)
     one_sentence(caught.value)
+
+
+def test_options_of_experiments_stand_apart_and_keep_their_names(tmp_path):
+    """They are declared in another class than a user's settings, under the flags and the JSON names that they always had."""
+    apart = {field.name for field in dataclasses.fields(AblationSettings)}
+    assert apart == {"geometry_time", "geometry_placement", "geometry_expert"}
+    assert not apart & set(PI05GeometryConfig.__annotations__)
+    make_config().save_pretrained(tmp_path)
+    saved = json.loads((tmp_path / "config.json").read_text())
+    saved |= {"geometry_expert": "own"}
+    (tmp_path / "config.json").write_text(json.dumps(saved))
+    loaded = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=["--geometry_time=denoise"])
+    assert (loaded.network().geometry.time, loaded.network().geometry.expert) == ("denoise", "own")
 
 
 @pytest.mark.parametrize("vlm", PALIGEMMA_VARIANTS)

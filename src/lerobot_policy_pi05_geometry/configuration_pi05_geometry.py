@@ -1,19 +1,29 @@
 """The policy's configuration: π0.5's, plus geometry. LeRobot finds it as `--policy.type=pi05_geometry`."""
 
-import logging
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any, get_args
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
+from .configuration_checks import check_choices, check_dropout, check_numbers, refuse_log_gate
 from .data.prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
 from .geometry.camera import CameraCalibration
-from .geometry.depth import METRES_PER_UNIT, MIN_DEPTH
-from .geometry.keys import DEPTH_SUFFIX, camera_of, is_geometry_key
+from .geometry.depth import METRES_PER_UNIT
+from .geometry.keys import (
+    IMAGE_PREFIX,
+    camera_of,
+    depth_camera_name,
+    find_depth_keys,
+    is_depth_key,
+    is_geometry_key,
+    select_cameras,
+)
+from .model.ablations import AblationSettings, check_placement
 from .model.config import (
     GeometryExpert,
     GeometryPlacement,
@@ -29,10 +39,11 @@ from .training.dropout import DropoutRates
 from .training.optim import OPTIMIZERS, AdamW8bitConfig
 from .training.schedule import GateAwareScheduleConfig
 
-logger = logging.getLogger(__name__)
-
-EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
+EMPTY_CAMERA = f"{IMAGE_PREFIX}empty_camera_"
 DEFAULT_ENCODER = "depth-anything/DA3-BASE"
+
+SOURCES = ("none", "rgbd", "da3", "features")
+CONTROLS = ("random",)  # sources for comparison only, see model/ablations.py
 
 _CHOICES = {
     "optimizer": OPTIMIZERS,
@@ -43,7 +54,7 @@ _CHOICES = {
     "param_dtype": tuple(DTYPES),
     "depth_unit": tuple(METRES_PER_UNIT),
     "inference_runner": get_args(RunnerName),
-    "geometry_source": ("none", "rgbd", "da3", "features", "random"),
+    "geometry_source": SOURCES + CONTROLS,
     "da3_dtype": tuple(DTYPES),
     "geometry_frame": ("base", "camera"),
     "geometry_time": get_args(GeometryTime),
@@ -55,8 +66,11 @@ _CHOICES = {
 
 @PreTrainedConfig.register_subclass("pi05_geometry")
 @dataclass
-class PI05GeometryConfig(PreTrainedConfig):
-    """Settings of `PI05GeometryPolicy`. Those without a comment are LeRobot's π0.5 settings, under its names."""
+class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
+    """Settings of `PI05GeometryPolicy`. Those without a comment are LeRobot's π0.5 settings, under its names.
+
+    Options that only experiments change are in `AblationSettings`. Fields under "recorded" are set by the program.
+    """
 
     paligemma_variant: str = "gemma_2b"  # gemma_2b, small, tiny
     action_expert_variant: str = "gemma_300m"  # gemma_300m, small, tiny
@@ -70,17 +84,14 @@ class PI05GeometryConfig(PreTrainedConfig):
     max_action_dim: int = 32
 
     # Geometry
-    # none (plain π0.5), rgbd (depth cameras), da3 (RGB cameras), features (da3, computed in advance), random (control)
+    # none (plain π0.5), rgbd (depth cameras), da3 (RGB cameras), features (da3, computed in advance)
     geometry_source: str = "rgbd"
     geometry_cameras: list[str] | None = (
         None  # names in token order; None: every camera that has depth, or RGB for da3 and features
     )
     geometry_grid: int = 8  # cells per side and camera
     geometry_frame: str = "base"  # points in the robot's base frame, or in the camera's
-    geometry_time: str = "clean"  # flow time that conditions geometry: clean (cached) or denoise (recomputed)
     geometry_positions: str = "sequential"  # rotary positions: sequential, or parallel (the suffix as in π0.5)
-    geometry_placement: str = "segment"  # a segment of its own, or in the VLM's prefix (comparison)
-    geometry_expert: str = "shared"  # the action expert's weights, or an own expert
     geometry_gate_openness: float = (
         1.0  # of the gate at the start: 1 open, 1e-7 shut (what `pi05-geometry convert` writes)
     )
@@ -92,11 +103,15 @@ class PI05GeometryConfig(PreTrainedConfig):
     camera_dropout: float = 0.0
     depth_unit: str = "mm"  # unit of the depth that arrives: mm (LeRobot's default) or m
     max_depth: float = 10.0  # metres; farther counts as not measured
-    calibration_path: str | None = None  # JSON file; None: calibration.json in the dataset's meta folder
-    calibration: dict[str, CameraCalibration] = field(default_factory=dict)  # what was read from it
+    calibration_path: str | None = None  # JSON file; None: what the dataset carries (geometry/dataset_calibration.py)
+    # Camera -> key of its depth. None is needed for observation.images.<camera>_depth, nor for a dataset's depth maps
+    # that LeRobot flags as such: the policy finds them.
+    depth_keys: dict[str, str] = field(default_factory=dict)
+
+    # Recorded about geometry
+    calibration: dict[str, CameraCalibration] = field(default_factory=dict)
     calibration_given: bool = False  # whether it was given as a file, and so holds over a dataset's own
-    # Depth and poses, set by validate_features.
-    geometry_features: dict[str, PolicyFeature] = field(default_factory=dict)
+    geometry_features: dict[str, PolicyFeature] = field(default_factory=dict)  # depth and poses, by validate_features
     # Depth cameras that a converted checkpoint has embeddings for, before any data has named them; then 0.
     geometry_pending: int = 0
 
@@ -172,70 +187,14 @@ class PI05GeometryConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, choices in _CHOICES.items():
-            if getattr(self, name) not in choices:
-                raise ValueError(f"--policy.{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}.")
+        check_choices(self, _CHOICES)
         if self.geometry_source == "da3" and self.da3_encoder is None:
             self.da3_encoder = DEFAULT_ENCODER
-        self._refuse_log_gate()
-        self._check_numbers()
-        self.network()  # names variants that do not belong together
-
-    def _check_numbers(self) -> None:
-        for name in ("chunk_size", "n_action_steps", "num_inference_steps", "geometry_grid", "flow_samples"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
-        if self.micro_batch_size is not None and self.micro_batch_size < 0:
-            raise ValueError(f"micro_batch_size must be 0 (off) or more, got {self.micro_batch_size}.")
-        if self.n_obs_steps != 1:
-            raise ValueError(
-                f"This policy sees one observation at a time: n_obs_steps must be 1, got {self.n_obs_steps}."
-            )
-        if self.geometry_cameras is not None and not self.geometry_cameras:
-            raise ValueError("geometry_cameras is empty; name a camera, or set geometry_source=none.")
-        if self.n_action_steps > self.chunk_size:
-            raise ValueError(f"n_action_steps ({self.n_action_steps}) must not exceed chunk_size ({self.chunk_size}).")
-        self._check_dropout()
-        if not 0 <= self.geometry_gate_openness < float("inf"):
-            raise ValueError(f"geometry_gate_openness must be 0 or more, got {self.geometry_gate_openness}.")
-        if self.geometry_placement == "prefix":
-            fixed = {"geometry_time": "clean", "geometry_positions": "sequential", "geometry_expert": "shared"}
-            for name, value in {**fixed, "geometry_gate_openness": 1.0}.items():
-                if getattr(self, name) != value:
-                    raise ValueError(
-                        f"geometry_placement=prefix puts geometry among the VLM's own tokens, where {name} has no meaning; "
-                        f"leave it at {value}."
-                    )
-        if not self.max_depth > MIN_DEPTH:
-            raise ValueError(f"max_depth must be above {MIN_DEPTH} m, got {self.max_depth}.")
-        if self.image_resolution[0] != self.image_resolution[1]:
-            raise ValueError(f"image_resolution must be square, got {tuple(self.image_resolution)}.")
-
-    def _check_dropout(self) -> None:
-        names = ("geometry_dropout", "image_dropout", "camera_dropout")
-        rates = {name: getattr(self, name) for name in names}
-        for name, rate in rates.items():
-            if not 0 <= rate < 1:
-                raise ValueError(f"{name} must be in [0, 1), got {rate}.")
-        if sum(rates.values()) > 1 + 1e-9:
-            told = ", ".join(f"{name} {rate}" for name, rate in rates.items())
-            raise ValueError(
-                f"One draw decides what a training sample goes without, so {told} must not exceed 1 together."
-            )
-
-    def _refuse_log_gate(self) -> None:
-        """Raise ValueError for a configuration of an earlier version, whose gate was a logarithm, where it has a gate."""
-        if (
-            self.geometry_gate_init is not None
-            and self.geometry_source != "none"
-            and self.geometry_placement == "segment"
-        ):
-            raise ValueError(
-                "This checkpoint is of an earlier version, whose gate was stored as a logarithm (geometry_gate_init); write a "
-                "new one with `pi05-geometry convert CHECKPOINT OUTPUT` and train that by --policy.path, since the state of its "
-                "optimiser does not carry over."
-            )
+        refuse_log_gate(self)
         self.geometry_gate_init = None
+        check_numbers(self)
+        check_dropout(self)
+        self.network()  # names variants that do not belong together
 
     def network(self) -> NetworkConfig:
         """The part of this that the network has to know."""
@@ -248,6 +207,7 @@ class PI05GeometryConfig(PreTrainedConfig):
                 expert=self.geometry_expert,  # type: ignore[arg-type]
                 openness=self.geometry_gate_openness,
             )
+            check_placement(geometry)
         return NetworkConfig(
             paligemma=PALIGEMMA_VARIANTS[self.paligemma_variant],
             expert=EXPERT_VARIANTS[self.action_expert_variant],
@@ -262,23 +222,25 @@ class PI05GeometryConfig(PreTrainedConfig):
             geometry=geometry,
         )
 
+    def record(self, changes: Mapping[str, Any]) -> None:
+        """Write back what `geometry.resolve` found in the data, so that a checkpoint carries it."""
+        known = {field.name for field in fields(self)}
+        assert set(changes) <= known, set(changes) - known
+        for name, value in changes.items():
+            setattr(self, name, value)
+
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
         """LeRobot calls this with a dataset's features, before it builds the policy.
 
-        A depth map under another name would pass for an RGB camera. A converted checkpoint learns its depth cameras here:
-        LeRobot takes features from the data only where a checkpoint has none.
+        Depth maps are found by LeRobot's flag, whatever their names. A policy that has its cameras keeps them; a
+        converted checkpoint learns them here: LeRobot takes features from the data only where a checkpoint has none.
         """
+        if self.geometry_features and not self.geometry_pending:
+            return
+        self.depth_keys = find_depth_keys(features, self.depth_keys)
         if self.geometry_pending:
-            geometry = {key: feature for key, feature in features.items() if is_geometry_key(key)}
+            geometry = {key: feature for key, feature in features.items() if is_geometry_key(key, self.depth_keys)}
             self.geometry_features = dataset_to_policy_features(geometry)
-        for key, feature in features.items():
-            info = feature.get("info") or {}
-            depth = info.get("is_depth_map") or info.get("video.is_depth_map")
-            if depth and not is_geometry_key(key):
-                logger.warning(
-                    "Dataset feature %s is a depth map, but its name does not end in '%s', by which the policy finds the "
-                    "depth of a camera; rename it to %s.<camera>%s.", key, DEPTH_SUFFIX, OBS_IMAGES, DEPTH_SUFFIX,
-                )  # fmt: skip
 
     def validate_features(self) -> None:
         """Complete the features, and move depth, calibration and cameras that may be absent out of `input_features`.
@@ -288,8 +250,8 @@ class PI05GeometryConfig(PreTrainedConfig):
         round, which depth in the data and an empty camera in the policy would both break.
         """
         inputs = dict(self.input_features or {})
-        for key in list(inputs):
-            if is_geometry_key(key):
+        for key, feature in list(inputs.items()):
+            if is_geometry_key(key, self.depth_keys) and not _is_rgb(key, feature):
                 self.geometry_features[key] = inputs.pop(key)
         for i in range(self.empty_cameras):
             shape = (3, *self.image_resolution)
@@ -321,35 +283,19 @@ class PI05GeometryConfig(PreTrainedConfig):
 
     def depth_cameras(self) -> dict[str, tuple[int, int]]:
         """Cameras with depth, in token order, and their (height, width)."""
-        prefix = f"{OBS_IMAGES}."
+        named = {key: camera for camera, key in self.depth_keys.items()}
         found = {
-            key.removeprefix(prefix).removesuffix(DEPTH_SUFFIX): (feature.shape[-2], feature.shape[-1])
+            named.get(key) or depth_camera_name(key): (feature.shape[-2], feature.shape[-1])
             for key, feature in self.geometry_features.items()
-            if key.startswith(prefix)
+            if is_depth_key(key, self.depth_keys)
         }
-        if self.geometry_cameras is None or (self.geometry_pending and not found):
-            return dict(sorted(found.items()))
-        unknown = [camera for camera in self.geometry_cameras if camera not in found]
-        if unknown:
-            raise ValueError(
-                f"geometry_cameras names {', '.join(unknown)}, but the data has depth from "
-                f"{', '.join(sorted(found)) or 'no camera'} only (keys {prefix}<camera>{DEPTH_SUFFIX})."
-            )
-        return {camera: found[camera] for camera in self.geometry_cameras}
+        wanted = None if self.geometry_pending and not found else self.geometry_cameras
+        return select_cameras(found, wanted, "depth")
 
     def rgb_cameras(self) -> dict[str, str]:
-        """RGB cameras that geometry looks through, in token order, and the key of their images."""
-        keys = sorted(key for key in self.image_features if not key.startswith(EMPTY_CAMERA))
-        found = {camera_of(key): key for key in keys}
-        if self.geometry_cameras is None:
-            return found
-        unknown = [camera for camera in self.geometry_cameras if camera not in found]
-        if unknown:
-            raise ValueError(
-                f"geometry_cameras names {', '.join(unknown)}, but the data has RGB images from "
-                f"{', '.join(found) or 'no camera'} only."
-            )
-        return {camera: found[camera] for camera in self.geometry_cameras}
+        """RGB cameras that geometry is computed from, in token order, and the key of their images."""
+        keys = [key for key in self.image_features if not key.startswith(EMPTY_CAMERA)]
+        return select_cameras({camera_of(key): key for key in sorted(keys)}, self.geometry_cameras, "RGB images")
 
     def optional_rgb_cameras(self) -> set[str]:
         """Those of `rgb_cameras` that observations may lack."""
@@ -399,3 +345,8 @@ class PI05GeometryConfig(PreTrainedConfig):
     @property
     def reward_delta_indices(self) -> None:
         return None
+
+
+def _is_rgb(key: str, feature: PolicyFeature) -> bool:
+    """Whether a feature named as depth is a colour image: a colourised depth map has lost its distances."""
+    return is_depth_key(key) and len(feature.shape) == 3 and feature.shape[0] == 3

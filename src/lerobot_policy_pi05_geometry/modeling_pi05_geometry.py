@@ -34,7 +34,7 @@ from .geometry import GeometryEncoder, GeometrySource
 from .geometry.da3 import Da3Encoder
 from .geometry.da3.weights import load_da3
 from .geometry.keys import camera_of
-from .geometry.resolve import build_source
+from .geometry.resolve import resolve
 from .inference.sampler import ChunkSampler
 from .inference.side_stream import PendingGeometry
 from .model import PI05Pytorch
@@ -85,8 +85,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     ) -> None:
         """dataset_stats, dataset_meta: what LeRobot's `make_policy` passes; the rest of it is not needed.
 
-        encoder: for a policy that looks live (da3, or features without a dataset), what `load_da3` returned for this
-        configuration; None: it is called here.
+        encoder: what `load_da3` returned for this configuration, for a policy that runs the encoder itself (da3, or features
+        without a dataset); None: it is loaded here.
         """
         super().__init__(config)
         config.validate_features()
@@ -112,7 +112,9 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self.reset()
 
     def _build_source(self, dataset_meta: Any | None, encoder: Da3Encoder | None) -> GeometrySource | None:
-        return build_source(self.config, dataset_meta, encoder)
+        source, changes = resolve(self.config, dataset_meta, encoder)
+        self.config.record(changes)
+        return source
 
     def _set_trainable(self) -> None:
         network = self.model.paligemma_with_expert

@@ -1,6 +1,7 @@
 """What arrives from LeRobot is checked: images, statistics, calibration."""
 
 import logging
+from copy import deepcopy
 from types import SimpleNamespace
 
 import pytest
@@ -11,7 +12,7 @@ from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.data.images import prepare_images
 from lerobot_policy_pi05_geometry.data.statistics import check_stats
 from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
-from lerobot_policy_pi05_geometry.geometry.resolve import resolve_calibration
+from lerobot_policy_pi05_geometry.geometry.resolve import resolve, resolve_calibration
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from tests.entry_points import FRONT, STATE, WRIST, make_batch, make_calibration, make_config, make_stats
 
@@ -152,7 +153,7 @@ def dataset(tmp_path) -> SimpleNamespace:
     """Metadata of a dataset that brings its own calibration, focal length 20."""
     (tmp_path / "dataset" / "meta").mkdir(parents=True)
     write_calibration_file(tmp_path / "dataset" / "meta" / "calibration.json", calibration_with_focal_length(20.0))
-    return SimpleNamespace(root=tmp_path / "dataset")
+    return SimpleNamespace(root=tmp_path / "dataset", features={})
 
 
 def focal_length(config: PI05GeometryConfig, meta: SimpleNamespace | None) -> float:
@@ -172,7 +173,7 @@ def test_what_was_given_once_holds_over_the_datasets(dataset):
 
 def test_without_a_given_file_the_datasets_holds_and_without_that_the_recorded_one(dataset):
     assert focal_length(make_config(calibration={}), dataset) == 20.0
-    assert focal_length(make_config(calibration={}), SimpleNamespace(root=str(dataset.root))) == 20.0
+    assert focal_length(make_config(calibration={}), SimpleNamespace(root=str(dataset.root), features={})) == 20.0
     recorded = make_config(calibration=calibration_with_focal_length(30.0))
     assert focal_length(recorded, None) == 30.0
     (dataset.root / "meta" / "calibration.json").unlink()
@@ -181,7 +182,9 @@ def test_without_a_given_file_the_datasets_holds_and_without_that_the_recorded_o
 
 def test_a_dataset_that_contradicts_the_checkpoint_is_an_error(dataset):
     assert focal_length(make_config(calibration=calibration_with_focal_length(20.0)), dataset) == 20.0
-    with pytest.raises(ValueError, match=r"calibration.json\) differs from the one recorded.*calibration_path"):
+    with pytest.raises(
+        ValueError, match=r"The calibration of the dataset at .* differs from the one recorded.*calibration_path"
+    ):
         focal_length(make_config(calibration=calibration_with_focal_length(30.0)), dataset)
 
 
@@ -200,6 +203,18 @@ def test_the_policy_keeps_what_it_read_and_not_where_from(tmp_path):
 def test_a_file_that_is_not_there_is_an_error_and_not_the_next_choice(dataset):
     with pytest.raises(FileNotFoundError, match=r"nowhere.json is not there"):
         resolve_calibration(make_config(calibration_path="nowhere.json"), dataset)
+
+
+def test_resolving_changes_no_configuration(dataset):
+    """What was found is returned; the policy alone writes it back."""
+    config = make_config(calibration={})
+    config.validate_features()
+    before = deepcopy(config)
+    source, changes = resolve(config, dataset)
+    assert config == before
+    assert source.calibration == changes["calibration"] == calibration_with_focal_length(20.0)
+    with pytest.raises(AssertionError):
+        config.record({"no_such_field": 1})
 
 
 def test_the_policy_takes_the_datasets_calibration(dataset):

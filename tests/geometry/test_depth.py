@@ -7,7 +7,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_policy_pi05_geometry.geometry.depth import check_measured, check_unit, to_metres
+from lerobot_policy_pi05_geometry.geometry.depth import (
+    SAMPLED_PIXELS,
+    check_measured,
+    check_unit,
+    sample_pixels,
+    to_metres,
+)
 from tests.geometry.scenes import generator, seeds
 
 KEY = "observation.images.front_depth"
@@ -113,3 +119,42 @@ def test_a_wrong_unit_in_one_sample_of_a_batch_is_found():
 def test_a_frame_without_measurement_says_nothing_about_the_unit():
     for nothing in (0.0, math.nan, math.inf, -1.0, 10.0):  # 10 mm is a hole in LeRobot's depth video
         check_unit(torch.full((1, 1, 4, 5), nothing), KEY, "mm")
+
+
+@given(seed=seeds, share=st.floats(0.55, 0.95))
+def test_holes_stored_as_the_largest_value_are_holes(seed, share):
+    """Live uint16, a dataset's float millimetres and its float metres: neither a measurement nor a sign of a wrong unit."""
+    millimetres = torch.randint(300, 2_000, (2, 1, 24, 32), generator=generator(seed))
+    hole = torch.rand(millimetres.shape, generator=generator(seed + 1)) < share
+    stored = millimetres.masked_fill(hole, 65535)
+    for depth, unit in (
+        (stored.to(torch.uint16), "mm"), (stored.int(), "mm"), (stored.float(), "mm"), (stored.float() / 1000, "m"),
+        (stored.double() / 1000, "m"),
+    ):  # fmt: skip
+        check_unit(depth, KEY, unit)
+        metres, valid = to_metres(depth, KEY, unit, (24, 32), max_depth=100.0)
+        assert torch.equal(valid, ~hole)
+        torch.testing.assert_close(metres, millimetres.masked_fill(hole, 0) / 1000)
+
+
+@pytest.mark.parametrize("dtype", [torch.int16, torch.int32])
+def test_the_largest_value_of_other_types_is_a_hole(dtype):
+    depth = torch.full((1, 1, 4, 4), torch.iinfo(dtype).max, dtype=dtype)
+    depth[..., 0] = 700
+    check_unit(depth, KEY, "mm")
+    assert to_metres(depth, KEY, "mm", (4, 4), 1e9)[1].sum() == 4
+
+
+def test_values_are_checked_on_a_sample_of_pixels_from_every_row_and_column():
+    for height, width in ((480, 640), (84, 84), (224, 224), (512, 512), (7, 9), (1, 1)):
+        v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        for coordinate, size in ((u, width), (v, height)):
+            seen = sample_pixels(coordinate.reshape(1, height, width, 1)).unique()
+            assert len(seen) >= min(size, SAMPLED_PIXELS) * 0.9
+        assert sample_pixels(u[None]).shape[1] < 2 * SAMPLED_PIXELS
+
+
+def test_the_error_of_a_wrong_unit_says_what_streaming_does():
+    """LeRobot ignores --dataset.depth_output_unit there, so the declared unit may be the right one."""
+    with pytest.raises(ValueError, match=r"LeRobot ignores that option with --dataset.streaming=true, and reads 'mm'"):
+        check_unit(torch.full((1, 1, 4, 5), 700.0), KEY, "m")

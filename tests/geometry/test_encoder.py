@@ -2,12 +2,14 @@
 
 import logging
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from lerobot_policy_pi05_geometry.geometry import GeometryEncoder
-from lerobot_policy_pi05_geometry.geometry.encoder import _Look
+from lerobot_policy_pi05_geometry.geometry import encoder as module
+from lerobot_policy_pi05_geometry.geometry.encoder import FIRST_CHECKED, _CameraStatus
 from lerobot_policy_pi05_geometry.geometry.random_tokens import RandomSource
 from lerobot_policy_pi05_geometry.geometry.rgbd import depth_key, extrinsics_key
 from tests.geometry.scenes import calibrated, generator, make_source, random_observation, random_pose
@@ -197,7 +199,7 @@ def test_on_a_gpu_what_was_seen_is_read_with_the_next_observation(caplog, monkey
         def synchronize(self) -> None:
             waits.append(1)
 
-    monkeypatch.setattr(_Look, "at", lambda alive, missing: _Look(alive, Arrival(), missing))
+    monkeypatch.setattr(_CameraStatus, "of", lambda alive, missing: _CameraStatus(alive, Arrival(), missing))
     encoder = make_encoder("left", "right")
     observation = observe(encoder)
     encoder(observation)
@@ -213,3 +215,30 @@ def test_on_a_gpu_what_was_seen_is_read_with_the_next_observation(caplog, monkey
     encoder.reset()  # the last observation of an episode is read too
     assert "'right' is back" in said(caplog, logging.INFO)[0]
     assert len(waits) == 4
+
+
+def test_on_a_gpu_training_checks_values_in_its_first_batches_and_then_in_few(monkeypatch):
+    """A check copies to the host, and a GPU waits for it. On a CPU nothing waits, and every batch is checked."""
+    encoder = make_encoder("front").train()
+    observation = observe(encoder)
+    asked = []
+    measure = encoder.source.forward
+
+    def count(batch, check=True):
+        asked.append(check)
+        return measure(batch, check=False)
+
+    monkeypatch.setattr(encoder.source, "forward", count)
+    for _ in range(3):
+        encoder(observation)
+    assert asked == [True] * 3
+    asked.clear()
+    on_gpu = SimpleNamespace(device=SimpleNamespace(type="cuda"))
+    monkeypatch.setattr(module, "batch_like", lambda batch: on_gpu)
+    encoder = make_encoder("front").train()
+    monkeypatch.setattr(encoder.source, "forward", count)
+    for _ in range(200):
+        encoder._measured(observation)
+    assert asked[:FIRST_CHECKED] == [True] * FIRST_CHECKED
+    assert sum(asked[FIRST_CHECKED:]) == 3
+    assert all(asked[i] for i in (64, 128, 192))

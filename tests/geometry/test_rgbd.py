@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
 from lerobot_policy_pi05_geometry.geometry.rgbd import WAVELENGTHS, cell_statistics, depth_key, extrinsics_key
@@ -304,3 +305,66 @@ def test_a_pose_in_the_frame_that_is_no_rigid_transform_is_refused(kind):
     batch = {depth_key("front"): torch.ones(2, 1, 12, 18), extrinsics_key("front"): pose}
     with pytest.raises(ValueError, match=r"calibration.front.extrinsics are no rigid transform"):
         one_camera()(batch)
+
+
+# --- names and forms in which depth and poses arrive ---------------------------------------------------------------
+
+
+class MatrixProducts(TorchDispatchMode):
+    """Counts what `allow_tf32` rounds: matrix products and convolutions."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        name = function.name().split("::")[1].split(".")[0]
+        if name in ("mm", "bmm", "addmm", "baddbmm", "dot", "mv", "convolution", "_scaled_mm"):
+            self.found.append(name)
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_points_come_from_no_product_that_tf32_may_round(moving):
+    """lerobot-train sets `allow_tf32`, which rounds the factors of matrix products on a GPU: up to 0.9 mm at 1 m."""
+    random = generator(0)
+    batch = {depth_key("front"): random_depth(random, 2, 12, 18)}
+    if moving:
+        batch[extrinsics_key("front")] = torch.stack([random_pose(random).float() for _ in range(2)])
+    with MatrixProducts() as products:
+        one_camera()(batch, check=False)
+    assert products.found == []
+    with MatrixProducts() as products:
+        torch.einsum("ij,bjk->bik", torch.eye(3), torch.ones(2, 3, 5))
+    assert products.found, "this counter finds none"
+
+
+def test_a_pose_of_16_numbers_is_a_pose_of_4_x_4():
+    random = generator(4)
+    poses = torch.stack([random_pose(random) for _ in range(2)]).float()
+    depth = random_depth(random, 2, 12, 18)
+    source = make_source({"front": calibrated(12, 18)}, 3)
+    expected = source({depth_key("front"): depth, extrinsics_key("front"): poses})
+    found = source({depth_key("front"): depth, extrinsics_key("front"): poses.flatten(1)})
+    assert torch.equal(found.features, expected.features)
+    for once in (poses[0], poses[0].flatten()):  # one pose for the whole batch
+        same = source({depth_key("front"): depth, extrinsics_key("front"): once})
+        assert torch.equal(same.features[0], expected.features[0])
+    with pytest.raises(ValueError, match=r"no rigid transform"):  # column by column
+        source({depth_key("front"): depth, extrinsics_key("front"): poses.mT.flatten(1)})
+    for shape in ((2, 12), (2, 3, 4), (2, 7)):
+        with pytest.raises(ValueError, match=r"16 numbers row by row or as 4 x 4, got shape"):
+            source({depth_key("front"): depth, extrinsics_key("front"): torch.zeros(shape)})
+
+
+def test_depth_is_found_under_its_recorded_key_and_under_lerobots():
+    depth = random_depth(generator(0), 2, 12, 18)
+    expected = one_camera()({depth_key("front"): depth})
+    source = one_camera(depth_keys={"front": "observation.depth.front"})
+    for key in ("observation.depth.front", depth_key("front")):
+        assert source.missing_cameras({key: depth}) == []
+        assert torch.equal(source({key: depth}).features, expected.features)
+    both = {"observation.depth.front": depth, depth_key("front"): 2 * depth}
+    assert torch.equal(source(both).features, expected.features)
+    assert source.missing_cameras({"observation.state": depth}) == ["front"]
+    assert "expected observation.depth.front " in source.missing_message(["front"])

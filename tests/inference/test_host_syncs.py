@@ -45,8 +45,8 @@ def fake(monkeypatch) -> FakeTensorMode:
     monkeypatch.setattr(fused_weights, "_already_joined", lambda weights: None)
     monkeypatch.setattr(runner, "Weights", NoWeights)
     monkeypatch.setattr(runner, "SideStream", lambda device, kind=runner.SideStream: kind(torch.device("cpu")))
-    arriving = encoder._Look(torch.ones(2, dtype=torch.bool), None, set())  # what was seen before
-    monkeypatch.setattr(encoder._Look, "at", lambda alive, missing: arriving)
+    arriving = encoder._CameraStatus(torch.ones(2, dtype=torch.bool), None, set())  # what was seen before
+    monkeypatch.setattr(encoder._CameraStatus, "of", lambda alive, missing: arriving)
     return FakeTensorMode(allow_non_fake_inputs=True)
 
 

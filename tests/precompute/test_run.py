@@ -210,7 +210,7 @@ def test_settings_that_cannot_be(dataset, whole, tmp_path):
         prepare(dataset, encoder, 3, cameras=["back"])
     with pytest.raises(ValueError, match="da3_image_size must be a multiple of 42"):
         prepare(dataset, encoder, 3, image_size=40)
-    with pytest.raises(FileNotFoundError, match="encoder cannot be had"):
+    with pytest.raises(FileNotFoundError, match="encoder is not found"):
         prepare(dataset, str(tmp_path / "nowhere"), 3)
     with pytest.raises(ValueError, match="--batch-size must be at least 1"):
         whole.run(0)

@@ -13,8 +13,8 @@ from lerobot.envs import preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_policy_pi05_geometry.data.quantiles import write_frame_quantiles
-from lerobot_policy_pi05_geometry.geometry.calibration import read_calibration_file
 from lerobot_policy_pi05_geometry.geometry.camera import check_rigid, transform, unproject
+from lerobot_policy_pi05_geometry.geometry.dataset_calibration import read_dataset_calibration
 from lerobot_policy_pi05_geometry.sim.cameras import CAMERA_RANGES, LOOK_AT
 from lerobot_policy_pi05_geometry.sim.configuration import MetaworldRgbdEnv
 from lerobot_policy_pi05_geometry.sim.environment import CAMERA, DEPTH_KEY, EXTRINSICS_KEY, RgbdMetaworldEnv
@@ -282,7 +282,7 @@ def test_what_is_recorded_is_what_the_environment_showed(recorded):
     environment.close()
     frame = dataset[0]
     assert np.array_equal(frame["observation.images.front_depth"].squeeze().numpy(), seen[DEPTH_KEY].squeeze())
-    assert np.array_equal(frame["observation.calibration.front.extrinsics"].numpy(), seen[EXTRINSICS_KEY])
+    assert np.array_equal(frame["observation.calibration.front.extrinsics"].numpy(), seen[EXTRINSICS_KEY].flatten())
     assert np.array_equal(frame["observation.state"].numpy(), seen["agent_pos"])
     np.testing.assert_allclose(frame["action"].numpy(), action, atol=1e-6)  # the expert's own, without the noise
     pixels = (255 * frame["observation.images.front"]).round().permute(1, 2, 0).numpy()
@@ -322,11 +322,10 @@ def test_quantiles_of_a_dataset_can_be_recomputed(recorded, tmp_path):
 
 def test_a_recording_brings_its_calibration(recorded):
     root, _ = recorded
-    camera = read_calibration_file(root / "meta" / "calibration.json")["front"]
+    camera = read_dataset_calibration(LeRobotDataset("local/two", root=root).meta, {})["front"]
     assert camera.size == [32, 32]
     assert camera.intrinsics[2:] == [15.5, 15.5]
     assert camera.extrinsics is None  # the pose comes with every frame
-    assert json.loads((root / "meta" / "calibration.json").read_text())["frame"] == "base"
 
 
 def test_a_recording_is_never_overwritten(recorded):

@@ -1,4 +1,4 @@
-"""The calibration file: how a real robot's user says what LeRobot drops when recording.
+"""The calibration file: intrinsics and poses of cameras, which LeRobot does not record.
 
 ```json
 {"frame": "base", "cameras": {"front": {"intrinsics": [600.0, 600.0, 319.5, 239.5], "size": [640, 480],
@@ -6,14 +6,18 @@
 ```
 
 `extrinsics` is null for a camera whose pose comes with every frame, as `observation.calibration.<cam>.extrinsics`.
+The same entries stand in a dataset's meta/info.json (dataset_calibration.py).
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from .camera import CameraCalibration
 
 CALIBRATION_FILE = "calibration.json"
+BASE_FRAME = "base"
 _CAMERA_FIELDS = {"intrinsics", "size", "extrinsics"}
 
 
@@ -28,15 +32,20 @@ def read_calibration_file(path: str | Path) -> dict[str, CameraCalibration]:
         content = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"Calibration file {path} is no JSON: {error}.") from error
+    return parse_calibration(content, path)
+
+
+def parse_calibration(content: Any, path: Path) -> dict[str, CameraCalibration]:
+    """Check the content of a calibration file and return its cameras. path: where it is from, for messages."""
     if (
         not isinstance(content, dict)
         or set(content) != {"frame", "cameras"}
         or not isinstance(content["cameras"], dict)
     ):
-        raise ValueError(f"Calibration file {path} must be an object with the entries 'frame' and 'cameras'.")
-    if content["frame"] != "base":
+        raise ValueError(f"The calibration in {path} must be an object with the entries 'frame' and 'cameras'.")
+    if content["frame"] != BASE_FRAME:
         raise ValueError(
-            f"Calibration file {path} gives extrinsics in frame {content['frame']!r}; only 'base', the robot's base, is known."
+            f"The calibration in {path} gives extrinsics in frame {content['frame']!r}; only 'base', the robot's base, is known."
         )
     cameras = {}
     for name, entry in content["cameras"].items():
@@ -60,7 +69,11 @@ def read_calibration_file(path: str | Path) -> dict[str, CameraCalibration]:
     return cameras
 
 
-def write_calibration_file(path: str | Path, cameras: dict[str, CameraCalibration]) -> None:
+def calibration_content(cameras: Mapping[str, CameraCalibration]) -> dict[str, Any]:
+    """What a calibration file says about these cameras, as JSON values."""
+    return {"frame": BASE_FRAME, "cameras": {name: vars(camera) for name, camera in cameras.items()}}
+
+
+def write_calibration_file(path: str | Path, cameras: Mapping[str, CameraCalibration]) -> None:
     """Write a calibration file that `read_calibration_file` reads back."""
-    entries = {name: vars(camera) for name, camera in cameras.items()}
-    Path(path).write_text(json.dumps({"frame": "base", "cameras": entries}, indent=2) + "\n")
+    Path(path).write_text(json.dumps(calibration_content(cameras), indent=2) + "\n")

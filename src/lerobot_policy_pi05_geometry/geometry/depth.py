@@ -5,6 +5,8 @@ environments float32 (B, H, W, 1). The unit cannot be guessed from the numbers, 
 scene that is then implausible is an error.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -15,6 +17,9 @@ PLAUSIBLE_MEDIAN = (0.02, 20.0)
 # Neither is a measurement, so valid depth is above MIN_DEPTH and below the configured maximum.
 MIN_DEPTH = 0.02
 _CODEC_FLOOR = 0.01
+_UINT16_MAX = 65535
+# Pixels of a frame that its values are checked on: the median of 1,024 of them is within 3 percentiles of the whole frame's.
+SAMPLED_PIXELS = 1024
 _DTYPES = (torch.uint16, torch.int16, torch.int32, torch.float16, torch.float32, torch.float64)
 
 
@@ -25,7 +30,7 @@ def to_metres(depth: Tensor, key: str, unit: str, size: tuple[int, int], max_dep
     the policy was configured with. max_depth: metres; what is as far or farther counts as not measured.
 
     Returns depth in metres, z along the optical axis, (B, 1, H, W) float32 with zeros where not valid, and validity
-    (B, 1, H, W) bool. NaN, inf, nearer than MIN_DEPTH and too far are not valid.
+    (B, 1, H, W) bool. NaN, inf, nearer than MIN_DEPTH, too far and the type's largest value are not valid.
 
     Raises ValueError for a dtype that no depth camera gives or a wrong size.
     """
@@ -44,27 +49,53 @@ def to_metres(depth: Tensor, key: str, unit: str, size: tuple[int, int], max_dep
             "(height x width, one channel); use the camera resolution it was trained with."
         )
     metres = depth.float() * METRES_PER_UNIT[unit]
-    valid = torch.isfinite(metres) & (metres > MIN_DEPTH) & (metres < max_depth)
+    valid = (
+        (metres > MIN_DEPTH) & (metres < max_depth) & ~is_largest_value(depth, unit)
+    )  # comparisons with NaN are False
     return metres.masked_fill(~valid, 0.0), valid
+
+
+def is_largest_value(depth: Tensor, unit: str) -> Tensor:
+    """Where raw depth is the largest value of the type it was recorded in, by which many cameras say "not measured".
+
+    That is 65535 for uint16. LeRobot's datasets return such a pixel as a float of the same number of millimetres, so
+    floats are compared with it too.
+    """
+    values = depth.float()
+    if depth.dtype.is_floating_point:
+        largest = _UINT16_MAX * METRES_PER_UNIT["mm"] / METRES_PER_UNIT[unit]
+        return (values - largest).abs() < 1e-6 * largest
+    return (values == _UINT16_MAX) | (values == torch.iinfo(depth.dtype).max)
+
+
+def sample_pixels(depth: Tensor) -> Tensor:
+    """Pixels of every frame, spread over all its rows and columns: (B, ...) -> (B, about SAMPLED_PIXELS)."""
+    pixels = depth.flatten(1)
+    step = max(1, pixels.shape[1] // SAMPLED_PIXELS)
+    while math.gcd(step, pixels.shape[1]) != 1:  # otherwise some columns are never seen
+        step += 1
+    return pixels[:, ::step]
 
 
 def check_measured(depth: Tensor, key: str) -> None:
     """Raise ValueError if a frame is all NaN. depth: as given to `to_metres`, batch first."""
-    dead = depth.float().flatten(1).isnan().all(dim=1)
-    if dead.any():
-        raise ValueError(
-            f"{key} is all NaN in sample {int(dead.nonzero()[0])} of the batch, so the depth camera measured nothing; "
-            "drop the frame from the dataset, or store 0 for pixels without a measurement."
-        )
+    suspects = sample_pixels(depth).float().isnan().all(dim=1).nonzero().flatten().tolist()
+    for sample in suspects:
+        if depth[sample].float().isnan().all():
+            raise ValueError(
+                f"{key} is all NaN in sample {sample} of the batch, so the depth camera measured nothing; drop the frame "
+                "from the dataset, or store 0 for pixels without a measurement."
+            )
 
 
 def check_unit(depth: Tensor, key: str, unit: str) -> None:
-    """Raise ValueError if the distances show that the declared unit is wrong.
+    """Raise ValueError if the distances show that the declared unit is wrong. A sample of pixels decides.
 
     depth: as given to `to_metres`, before validity (a wrong unit would make everything "too far").
     """
-    metres = depth.float().flatten(1) * METRES_PER_UNIT[unit]
-    seen = metres.isfinite() & (metres > 0) & ((metres - _CODEC_FLOOR).abs() > 1e-4)
+    pixels = sample_pixels(depth)
+    metres = pixels.float() * METRES_PER_UNIT[unit]
+    seen = metres.isfinite() & (metres > 0) & ((metres - _CODEC_FLOOR).abs() > 1e-4) & ~is_largest_value(pixels, unit)
     metres = metres.masked_fill(~seen, float("nan")).nanmedian(dim=1).values
     low, high = PLAUSIBLE_MEDIAN
     wrong = (metres < low) | (metres > high)  # NaN (nothing measured) is neither
@@ -72,5 +103,6 @@ def check_unit(depth: Tensor, key: str, unit: str) -> None:
         raise ValueError(
             f"{key} has a median distance of {metres[wrong][0].item():.4g} m when read as '{unit}', outside {low}-{high} "
             "m: the unit is probably wrong; set --policy.depth_unit to the unit of the data ('mm' or 'm'; LeRobot "
-            "datasets read as --dataset.depth_output_unit says, 'mm' by default)."
+            "datasets are read as --dataset.depth_output_unit says, 'mm' by default, but LeRobot ignores that option with "
+            "--dataset.streaming=true, and reads 'mm')."
         )

@@ -1,9 +1,9 @@
-"""Source and adapter together, and what to do when a camera that geometry needs fails.
+"""Source and adapter together, and the handling of a camera that fails.
 
-In training, a missing camera or a frame of NaN is an error: the data is wrong. On a robot it is weather: once geometry has
-been seen, a camera that goes silent (its key is missing, or no pixel is valid) is masked, said once, and used again when
-it returns. A robot that never had its key is misconfigured, which is an error again. On a GPU this is said one observation
-later, so that no chunk waits for it.
+In training, a missing camera or a frame of NaN is an error of the data. On a robot, a camera that has delivered geometry may
+fail: its key is missing, or no pixel is valid. Its tokens are then masked, and used again when it returns; both are logged once.
+A robot that never delivered the key is configured wrongly, which is an error. On a GPU a failure is logged one observation
+later, so that no chunk waits for the copy to the host.
 """
 
 import logging
@@ -21,11 +21,16 @@ from .source import GeometryFeatures, GeometrySource
 
 logger = logging.getLogger(__name__)
 
+# In training, values (units, poses) are checked in the first batches of a run, and then in one batch of so many. Each check
+# copies a result to the host, which a GPU would wait for in every step. On a CPU every batch is checked.
+FIRST_CHECKED = 16
+CHECKED_EVERY = 64
 
-class _Look(NamedTuple):
-    """Which cameras gave something, (V,) bool, on its way to the host if a GPU has it; and which were not there at all.
 
-    It is read with the next observation, when it has long arrived: to wait for it would be to wait for the GPU.
+class _CameraStatus(NamedTuple):
+    """Which cameras have a valid cell, (V,) bool, being copied to the host if it is on a GPU; and which were absent.
+
+    It is read with the next observation, when the copy has finished. Reading it at once would wait for the GPU.
     """
 
     alive: Tensor
@@ -33,7 +38,7 @@ class _Look(NamedTuple):
     missing: set[str]
 
     @classmethod
-    def at(cls, alive: Tensor, missing: set[str]) -> "_Look":
+    def of(cls, alive: Tensor, missing: set[str]) -> "_CameraStatus":
         if alive.device.type != "cuda":
             return cls(alive, None, missing)
         arrived = torch.cuda.Event()
@@ -42,7 +47,7 @@ class _Look(NamedTuple):
         return cls(copy, arrived, missing)
 
     @property
-    def on_its_way(self) -> bool:
+    def pending(self) -> bool:
         return self.arrived is not None
 
     def read(self) -> list[bool]:
@@ -61,28 +66,34 @@ class GeometryEncoder(nn.Module):
         self._seen: set[str] = set()
         self._failed: set[str] = set()
         self._checked = False
-        self._unread: _Look | None = None
+        self._unread: _CameraStatus | None = None
+        self._training_batches = 0
 
     def reset(self) -> None:
-        """Start of an episode: look into the values of the next observation again."""
-        self._take_note()
+        """Start of an episode: check the values of the next observation again."""
+        self._update_status()
         self._checked = False
 
     def forward(self, batch: Mapping[str, Tensor]) -> GeometryTokens:
-        # A caller's autocast would place points to within millimetres only, and training's is not inference's.
+        # A caller's autocast would round points to millimetres, and training has another autocast than inference.
         with compute_in_float32(batch_like(batch).device):
             return self.adapter(self._measured(batch) if self.training else self._live(batch))
 
     def _measured(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
-        """Features of a training batch, where every camera must be there, but for optional ones."""
+        """Features of a training batch, where every camera that is not optional must be present."""
         missing = [camera for camera in self.source.missing_cameras(batch) if camera not in self.source.optional]
         if missing:
             raise ValueError(self.source.missing_message(missing))
-        return self.source(batch, check=True)
+        check = batch_like(batch).device.type == "cpu" or self._check_is_due()
+        self._training_batches += 1
+        return self.source(batch, check=check)
+
+    def _check_is_due(self) -> bool:
+        return self._training_batches < FIRST_CHECKED or self._training_batches % CHECKED_EVERY == 0
 
     def _live(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
         """Features at inference: a camera that fails is masked, once it has been seen."""
-        self._take_note()
+        self._update_status()
         missing = self.source.missing_cameras(batch)
         unknown = [camera for camera in missing if camera not in self._seen | self.source.optional]
         if unknown:
@@ -91,19 +102,19 @@ class GeometryEncoder(nn.Module):
             self._report(set(missing))
             return self._nothing(batch)
         geometry = self.source(batch, check=not self._checked)
-        self._unread = _Look.at(geometry.valid.any(dim=-1).any(dim=0), set(missing))
-        if not self._unread.on_its_way:
-            self._take_note()
+        self._unread = _CameraStatus.of(geometry.valid.any(dim=-1).any(dim=0), set(missing))
+        if not self._unread.pending:
+            self._update_status()
         return geometry
 
-    def _take_note(self) -> None:
-        """Of which cameras gave something in the last observation."""
-        look, self._unread = self._unread, None
-        if look is None:
+    def _update_status(self) -> None:
+        """Take over which cameras delivered geometry in the last observation."""
+        status, self._unread = self._unread, None
+        if status is None:
             return
-        alive = {camera for camera, ok in zip(self.source.cameras, look.read(), strict=True) if ok}
+        alive = {camera for camera, ok in zip(self.source.cameras, status.read(), strict=True) if ok}
         self._checked = self._checked or bool(alive)
-        self._seen |= alive - look.missing
+        self._seen |= alive - status.missing
         self._report(set(self.source.cameras) - alive)
 
     def _nothing(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
@@ -116,9 +127,9 @@ class GeometryEncoder(nn.Module):
         )
 
     def _report(self, failed: set[str]) -> None:
-        """Say once that a camera failed, and once that it is back."""
+        """Log once that a camera failed, and once that it is back."""
         for camera in sorted(failed - self._failed):
-            logger.warning("Geometry camera '%s' gives nothing: its geometry is masked until it returns.", camera)
+            logger.warning("Geometry camera '%s' delivers no geometry: its tokens are masked until it returns.", camera)
         for camera in sorted(self._failed - failed):
             logger.info("Geometry camera '%s' is back.", camera)
         self._failed = failed

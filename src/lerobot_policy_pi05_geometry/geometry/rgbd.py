@@ -1,7 +1,7 @@
 """Geometry from depth cameras: metric depth -> point map -> per-cell statistics.
 
-Points in the robot's base frame say where things are whatever the camera's pose; in the camera frame they do not, and
-then the network has to undo the pose by itself, which costs success where the camera stands elsewhere (docs/results.md).
+Points in the robot's base frame do not depend on the camera's pose. Points in the camera frame do: the network then has to
+learn the pose, and success falls where the camera stands elsewhere than in training (docs/results.md).
 """
 
 from collections.abc import Mapping
@@ -10,9 +10,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from .camera import CameraCalibration, check_rigid, transform, unproject
+from .camera import CameraCalibration, as_pose, check_rigid, transform, unproject
 from .depth import check_measured, check_unit, to_metres
-from .keys import depth_key, extrinsics_key
+from .keys import depth_key, extrinsics_key, find_depth_key
 from .source import GeometryFeatures, GeometrySource
 
 # Wavelengths of the Fourier features of a point, in metres: from a workspace down to the width of a finger.
@@ -24,8 +24,8 @@ class RgbdSource(GeometrySource):
     """Per cell: mean point (3), spread (3), fraction of valid pixels (1), Fourier features of the mean (6 per wavelength).
 
     calibration: per camera. sizes: (H, W) of each camera's depth. base_frame: points in the robot's base instead of
-    the camera. unit, max_depth: see `depth.to_metres`. Sources: Fourier features as in NeRF (Mildenhall et al., 2020),
-    with wavelengths in metres.
+    the camera. unit, max_depth: see `depth.to_metres`. depth_keys: see `keys.find_depth_key`.
+    Sources: Fourier features as in NeRF (Mildenhall et al., 2020), with wavelengths in metres.
     """
 
     def __init__(
@@ -37,27 +37,34 @@ class RgbdSource(GeometrySource):
         base_frame: bool,
         unit: str,
         max_depth: float,
+        depth_keys: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__()
         self.cameras, self.grid = cameras, grid
         self.feature_dim = FEATURE_DIM
         self.sizes, self.base_frame, self.unit, self.max_depth = dict(sizes), base_frame, unit, max_depth
+        self.depth_keys = dict(depth_keys or {})
         self.calibration = {camera: calibration[camera] for camera in cameras}
         self._on_device: dict[tuple[str, torch.device], tuple[Tensor, Tensor | None]] = {}
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
         return [
-            camera for camera in self.cameras if depth_key(camera) not in batch or not self._has_pose(camera, batch)
+            camera
+            for camera in self.cameras
+            if find_depth_key(camera, batch, self.depth_keys) is None or not self._has_pose(camera, batch)
         ]
 
     def missing_message(self, cameras: list[str]) -> str:
-        keys = ", ".join(depth_key(camera) for camera in cameras)
+        keys = ", ".join(self._expected_key(camera) for camera in cameras)
         poses = ", ".join(extrinsics_key(camera) for camera in cameras)
         return (
             f"The observation has no depth from camera(s) {', '.join(cameras)}: expected {keys} (and, for a camera without "
             f"extrinsics in its calibration, {poses}); connect the depth camera, rename its key with --rename_map, or train "
             "with --policy.geometry_source=none."
         )
+
+    def _expected_key(self, camera: str) -> str:
+        return self.depth_keys.get(camera, depth_key(camera))
 
     def _has_pose(self, camera: str, batch: Mapping[str, Tensor]) -> bool:
         known = not self.base_frame or self.calibration[camera].extrinsics is not None
@@ -67,7 +74,7 @@ class RgbdSource(GeometrySource):
         missing = self.missing_cameras(batch)
         present = [camera for camera in self.cameras if camera not in missing]
         if not present:
-            raise ValueError(f"No depth in the batch; expected {', '.join(depth_key(c) for c in self.cameras)}.")
+            raise ValueError(f"No depth in the batch; expected {', '.join(map(self._expected_key, self.cameras))}.")
         measured = {camera: self._camera(camera, batch, check) for camera in present}
         like = measured[present[0]]
         absent = GeometryFeatures(torch.zeros_like(like.features), torch.zeros_like(like.valid))
@@ -78,7 +85,8 @@ class RgbdSource(GeometrySource):
 
     def _camera(self, camera: str, batch: Mapping[str, Tensor], check: bool) -> GeometryFeatures:
         """Features (B, G, C) and validity (B, G) of one camera."""
-        key = depth_key(camera)
+        key = find_depth_key(camera, batch, self.depth_keys)
+        assert key is not None
         raw = batch[key]
         depth, valid = to_metres(raw, key, self.unit, self.sizes[camera], self.max_depth)
         if check:
@@ -87,24 +95,24 @@ class RgbdSource(GeometrySource):
                 check_measured(raw, key)
         points = unproject(depth, self._constants(camera, depth.device)[0])
         if self.base_frame:
-            points = transform(self._pose(camera, batch, check), points)
-        valid = valid & points.isfinite().all(dim=1, keepdim=True)  # a pose that turns NaN places nothing
+            points = transform(self._pose(camera, batch, depth.device, check), points)
+        valid = valid & points.isfinite().all(dim=1, keepdim=True)  # with a pose of NaN no point is known
         return cell_statistics(points, valid, self.grid)
 
-    def _pose(self, camera: str, batch: Mapping[str, Tensor], check: bool) -> Tensor:
+    def _pose(self, camera: str, batch: Mapping[str, Tensor], device: torch.device, check: bool) -> Tensor:
         """`base_T_camera`, (B, 4, 4) from the batch or (4, 4) from the calibration."""
         key = extrinsics_key(camera)
         if key in batch:
-            pose = batch[key]
+            pose = as_pose(batch[key], key)
             if check:
                 check_rigid(pose, key)
             return pose
-        fixed = self._constants(camera, batch[depth_key(camera)].device)[1]
+        fixed = self._constants(camera, device)[1]
         assert fixed is not None
         return fixed
 
     def _constants(self, camera: str, device: torch.device) -> tuple[Tensor, Tensor | None]:
-        """Intrinsics (4,) for images of `sizes`, and `base_T_camera` (4, 4) or None. Copied to a GPU once: it is waited for."""
+        """Intrinsics (4,) for images of `sizes`, and `base_T_camera` (4, 4) or None. Kept, since a copy to a GPU blocks."""
         if (camera, device) not in self._on_device:
             calibration = self.calibration[camera]
             intrinsics = torch.tensor(calibration.scaled_intrinsics(*self.sizes[camera]), device=device)

@@ -109,9 +109,10 @@ def prepare(
     if not keys:
         raise ValueError(f"The dataset {root} has no RGB images, so there is nothing to compute features from.")
     source = Da3Source(keys, grid, load_da3(config), config.da3_image_size)
+    assert source.encoder.content_hash is not None
     manifest = Manifest(
         encoder=encoder,
-        encoder_hash=str(config.da3_hash),
+        encoder_hash=source.encoder.content_hash,
         image_size=source.image_size,
         dtype=dtype,
         grid=grid,

@@ -10,7 +10,7 @@ from datasets.utils.logging import disable_progress_bar
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from ..data.quantiles import write_frame_quantiles
-from ..geometry.calibration import CALIBRATION_FILE, write_calibration_file
+from ..geometry.dataset_calibration import write_dataset_calibration
 from .environment import ACTION_NAMES, CAMERA, DEPTH_KEY, EXTRINSICS_KEY, FPS, STATE_NAMES, RgbdMetaworldEnv
 from .tasks import make_expert
 
@@ -18,16 +18,19 @@ logger = logging.getLogger(__name__)
 
 # Recording seeds start here, evaluation seeds at 0, so no training episode is evaluated.
 FIRST_SEED = 1_000_000
+POSE_NAMES = [f"{CAMERA}.pose.{row}{column}" for row in range(4) for column in range(4)]
 
 
 def dataset_features(image_size: int) -> dict[str, dict]:
     """LeRobot features of a recording."""
     axes = ["height", "width", "channels"]
-    depth = {"dtype": "image", "shape": (image_size, image_size, 1), "names": axes, "info": {"is_depth_map": True}}
+    info = {"is_depth_map": True, "depth_unit": "mm"}
+    depth = {"dtype": "image", "shape": (image_size, image_size, 1), "names": axes, "info": info}
     return {
         f"observation.images.{CAMERA}": {"dtype": "image", "shape": (image_size, image_size, 3), "names": axes},
         f"observation.{DEPTH_KEY}": depth,
-        f"observation.{EXTRINSICS_KEY}": {"dtype": "float32", "shape": (4, 4), "names": None},
+        # base_T_camera row by row: LeRobot's tools cannot edit a column of more than one dimension.
+        f"observation.{EXTRINSICS_KEY}": {"dtype": "float32", "shape": (16,), "names": POSE_NAMES},
         "observation.state": {"dtype": "float32", "shape": (4,), "names": STATE_NAMES},
         "action": {"dtype": "float32", "shape": (4,), "names": ACTION_NAMES},
     }
@@ -83,7 +86,7 @@ def record(
             yield done, frames is not None
         dataset.finalize()
         write_frame_quantiles(unfinished, repo_id)
-        write_calibration_file(unfinished / "meta" / CALIBRATION_FILE, environment.calibration)
+        write_dataset_calibration(unfinished, environment.calibration)
         unfinished.rename(root)
     finally:
         environment.close()
@@ -101,7 +104,7 @@ def _attempt(environment: RgbdMetaworldEnv, seed: int, action_noise: float) -> l
             {
                 f"observation.images.{CAMERA}": observation["pixels"][CAMERA],
                 f"observation.{DEPTH_KEY}": observation[DEPTH_KEY].astype(np.uint16),
-                f"observation.{EXTRINSICS_KEY}": observation[EXTRINSICS_KEY],
+                f"observation.{EXTRINSICS_KEY}": observation[EXTRINSICS_KEY].flatten(),
                 "observation.state": observation["agent_pos"],
                 "action": action,
             }

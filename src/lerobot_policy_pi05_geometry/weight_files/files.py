@@ -1,6 +1,7 @@
 """Files of a checkpoint: found in a local folder or on the hub, and folders that are written whole or not at all."""
 
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -74,6 +75,19 @@ def new_folder(output: Path, size: int) -> Iterator[Path]:
         if not output.exists():
             for folder in missing:
                 folder.rmdir()
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a small text file so that it is there whole or not at all, whenever the process or the machine stops.
+
+    For one process at a time: the name of the unfinished file is fixed, so that one left behind is overwritten.
+    """
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    with unfinished.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(unfinished, path)
 
 
 def require_policy_type(model_id: str | Path, expected: str, **hub: Any) -> None:

@@ -122,9 +122,7 @@ def test_an_encoder_that_moved_is_named_anew(encoder, tmp_path):
     policy = make_da3(own)
     policy.save_pretrained(tmp_path / "checkpoint")
     shutil.rmtree(own)
-    with pytest.raises(
-        FileNotFoundError, match=rf"encoder cannot be had: .*{own} is not there; .*--policy.da3_encoder"
-    ):
+    with pytest.raises(FileNotFoundError, match=rf"encoder is not found: .*{own} is not there; .*--policy.da3_encoder"):
         PI05GeometryPolicy.from_pretrained(tmp_path / "checkpoint")
     config = PreTrainedConfig.from_pretrained(tmp_path / "checkpoint", cli_overrides=[f"--da3_encoder={encoder}"])
     loaded = PI05GeometryPolicy.from_pretrained(tmp_path / "checkpoint", config=config)
@@ -167,7 +165,7 @@ def test_a_camera_that_may_be_absent_is_left_out(encoder):
 def test_without_rgb_it_is_refused(encoder):
     inputs, outputs = make_features()
     inputs = {key: feature for key, feature in inputs.items() if key not in (FRONT, WRIST)}
-    with pytest.raises(ValueError, match=r"geometry_source=da3 looks at RGB images.*geometry_source=none"):
+    with pytest.raises(ValueError, match=r"geometry_source=da3 is computed from RGB images.*geometry_source=none"):
         make_da3(encoder, input_features=inputs, output_features=outputs, empty_cameras=1)
 
 

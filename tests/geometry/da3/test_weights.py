@@ -129,17 +129,18 @@ def test_the_hash_changes_with_every_tensor(tmp_path):
     assert len(hashes) == len(names) + 2
 
 
-def test_the_hash_is_recorded_at_first_use_and_verified_ever_after(tmp_path):
+def test_the_hash_is_told_at_first_use_and_verified_ever_after(tmp_path):
     path, other = write_tiny(tmp_path / "a" / "model.safetensors"), write_tiny(tmp_path / "b" / "model.safetensors", 1)
     config = config_of(path)
     assert config.da3_hash is None
-    load_da3(config)
-    assert config.da3_hash == backbone_hash(path)
-    load_da3(config)
+    found = load_da3(config).content_hash
+    assert found == backbone_hash(path)
+    assert config.da3_hash is None, "loading changes no configuration"
+    load_da3(config_of(path, da3_hash=found))
     copy = shutil.copytree(path.parent, tmp_path / "c")
-    load_da3(config_of(copy, da3_hash=config.da3_hash))
-    message = refusal(other, da3_hash=config.da3_hash)
-    assert config.da3_hash in message
+    load_da3(config_of(copy, da3_hash=found))
+    message = refusal(other, da3_hash=found)
+    assert found in message
     assert backbone_hash(other) in message
     assert f"another encoder than {other}" in message
 

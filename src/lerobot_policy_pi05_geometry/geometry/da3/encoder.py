@@ -13,10 +13,16 @@ DEVIATION = (0.229, 0.224, 0.225)
 
 
 class Da3Encoder(nn.Module):
-    """Always in evaluation mode, without gradients, computing in `dtype` whatever autocast its caller has on."""
+    """Always in evaluation mode, without gradients, computing in `dtype` whatever autocast its caller has on.
 
-    def __init__(self, backbone: Da3Backbone, dtype: torch.dtype = torch.bfloat16) -> None:
+    content_hash: SHA-256 of the backbone's released tensors, None for weights that come from no file.
+    """
+
+    def __init__(
+        self, backbone: Da3Backbone, dtype: torch.dtype = torch.bfloat16, content_hash: str | None = None
+    ) -> None:
         super().__init__()
+        self.content_hash = content_hash
         self.variant, self.dtype = backbone.variant, dtype
         self.backbone = backbone.requires_grad_(False)
         self.register_buffer("mean", torch.tensor(MEAN).view(3, 1, 1), persistent=False)

@@ -1,7 +1,7 @@
-"""Depth Anything 3's weights: found by name, known by content, and never in the policy's own checkpoint.
+"""Depth Anything 3's weights: found by name, identified by content, and never part of the policy's own checkpoint.
 
-The checkpoint records which encoder it was trained with: its id, and the SHA-256 of its backbone's tensors. Tensors rather
-than the file, so that a copy without the heads, or written by another version of safetensors, is the same encoder.
+The checkpoint records the encoder that it was trained with: its id, and the SHA-256 of its backbone's tensors. The hash is of
+the tensors and not of the file: a copy without the heads, or one written by another version of safetensors, is the same encoder.
 """
 
 import hashlib
@@ -28,10 +28,10 @@ _warned: set[str] = set()
 
 
 def load_da3(config: "PI05GeometryConfig") -> Da3Encoder:
-    """The encoder that the configuration names, on the CPU; records its hash in the configuration, or verifies it.
+    """The encoder that the configuration names, on the CPU; a hash that the configuration has is verified.
 
-    Not to be called where parameters are made on the meta device: its weights are real from the start.
-    Raises FileNotFoundError or ValueError, with one sentence, for an encoder that cannot be had, is broken, or is another.
+    Do not call it where parameters are created on the meta device: its weights are read at once.
+    Raises FileNotFoundError or ValueError, with one sentence, for an encoder that is not found, is damaged, or is another.
     """
     name = config.da3_encoder
     if name is None:
@@ -51,8 +51,7 @@ def load_da3(config: "PI05GeometryConfig") -> Da3Encoder:
         backbone = Da3Backbone(variant)
     store_products_in(backbone, dtype)
     load_strictly(backbone, path, BACKBONE_PREFIX, OTHER_PREFIXES)
-    config.da3_hash = found
-    return Da3Encoder(backbone, dtype)
+    return Da3Encoder(backbone, dtype, found)
 
 
 def read_variant(path: Path) -> Da3Variant:
@@ -85,7 +84,7 @@ def find_encoder(encoder: str) -> Path:
         return find_file(encoder, SAFETENSORS_SINGLE_FILE)
     except FileNotFoundError as error:
         raise FileNotFoundError(
-            f"The Depth Anything 3 encoder cannot be had: {str(error).removesuffix('.')}; give a hub id, a folder or a "
+            f"The Depth Anything 3 encoder is not found: {str(error).removesuffix('.')}; give a hub id, a folder or a "
             "safetensors file by --policy.da3_encoder (a checkpoint holds none of the encoder's weights)."
         ) from error
 

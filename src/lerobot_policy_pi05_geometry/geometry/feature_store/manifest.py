@@ -2,9 +2,10 @@
 
 import hashlib
 import json
-import os
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+
+from ...weight_files.files import write_whole
 
 MANIFEST_FILE = "manifest.json"
 FORMAT = 1
@@ -95,16 +96,3 @@ def read_manifest(folder: Path) -> Manifest:
     if manifest.key != key:
         raise ValueError(f"{path} was changed by hand: its key is {key}, its content has {manifest.key}; restore it.")
     return manifest
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a small file so that it is there whole or not at all, whenever the process or the machine stops.
-
-    One process at a time: the name of the unfinished file is fixed, so that one left behind is overwritten.
-    """
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    with unfinished.open("w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(unfinished, path)

@@ -1,6 +1,6 @@
-"""A feature store matched to a policy and a dataset: found, compared, and recorded in the configuration.
+"""A feature store matched to a policy and a dataset: found and compared.
 
-Training needs no encoder then; the checkpoint records which one the features are from, and acts with that one.
+Training from a store needs no encoder. The checkpoint records which encoder the features are from, and runs that one.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ STORES = "geometry"  # folder of a dataset that holds its stores
 
 
 def open_store(config: "PI05GeometryConfig", root: Path) -> FeatureStore:
-    """The store for this policy and the dataset at `root`; records encoder, image size and hash in the configuration.
+    """The store for this policy and the dataset at `root`.
 
     Raises FileNotFoundError or ValueError, with one sentence, if there is none, it does not fit, or it is damaged.
     """
@@ -30,8 +30,6 @@ def open_store(config: "PI05GeometryConfig", root: Path) -> FeatureStore:
         raise ValueError(f"The feature store {folder} does not fit: {reason}.")
     store = FeatureStore(folder)
     store.read_ahead()
-    config.da3_encoder = config.da3_encoder or manifest.encoder
-    config.da3_hash, config.da3_image_size = manifest.encoder_hash, manifest.image_size
     return store
 
 

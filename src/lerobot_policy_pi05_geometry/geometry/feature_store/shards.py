@@ -16,7 +16,8 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
 
-from .manifest import Manifest, write_whole
+from ...weight_files.files import write_whole
+from .manifest import Manifest
 
 _CRC_ELEMENTS = 2  # a CRC-32 is as long as two bfloat16 numbers
 

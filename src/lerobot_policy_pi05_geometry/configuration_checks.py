@@ -1,0 +1,65 @@
+"""Checks of the configuration's values: each raises ValueError with one sentence that names the setting."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from .geometry.depth import MIN_DEPTH
+
+if TYPE_CHECKING:
+    from .configuration_pi05_geometry import PI05GeometryConfig
+
+
+def check_choices(config: "PI05GeometryConfig", choices: Mapping[str, tuple[str, ...]]) -> None:
+    """Raise ValueError for a setting that is none of its choices."""
+    for name, known in choices.items():
+        if getattr(config, name) not in known:
+            raise ValueError(f"--policy.{name} must be one of {', '.join(known)}, got {getattr(config, name)!r}.")
+
+
+def check_numbers(config: "PI05GeometryConfig") -> None:
+    """Raise ValueError for a number that is out of its range."""
+    for name in ("chunk_size", "n_action_steps", "num_inference_steps", "geometry_grid", "flow_samples"):
+        if getattr(config, name) < 1:
+            raise ValueError(f"{name} must be at least 1, got {getattr(config, name)}.")
+    if config.micro_batch_size is not None and config.micro_batch_size < 0:
+        raise ValueError(f"micro_batch_size must be 0 (off) or more, got {config.micro_batch_size}.")
+    if config.n_obs_steps != 1:
+        raise ValueError(
+            f"This policy sees one observation at a time: n_obs_steps must be 1, got {config.n_obs_steps}."
+        )
+    if config.geometry_cameras is not None and not config.geometry_cameras:
+        raise ValueError("geometry_cameras is empty; name a camera, or set geometry_source=none.")
+    if config.n_action_steps > config.chunk_size:
+        raise ValueError(f"n_action_steps ({config.n_action_steps}) must not exceed chunk_size ({config.chunk_size}).")
+    if not 0 <= config.geometry_gate_openness < float("inf"):
+        raise ValueError(f"geometry_gate_openness must be 0 or more, got {config.geometry_gate_openness}.")
+    if not config.max_depth > MIN_DEPTH:
+        raise ValueError(f"max_depth must be above {MIN_DEPTH} m, got {config.max_depth}.")
+    if config.image_resolution[0] != config.image_resolution[1]:
+        raise ValueError(f"image_resolution must be square, got {tuple(config.image_resolution)}.")
+
+
+def check_dropout(config: "PI05GeometryConfig") -> None:
+    """Raise ValueError unless the modality dropout rates are probabilities that go together."""
+    names = ("geometry_dropout", "image_dropout", "camera_dropout")
+    rates = {name: getattr(config, name) for name in names}
+    for name, rate in rates.items():
+        if not 0 <= rate < 1:
+            raise ValueError(f"{name} must be in [0, 1), got {rate}.")
+    if sum(rates.values()) > 1 + 1e-9:
+        told = ", ".join(f"{name} {rate}" for name, rate in rates.items())
+        raise ValueError(f"One draw decides what a training sample goes without, so {told} must not exceed 1 together.")
+
+
+def refuse_log_gate(config: "PI05GeometryConfig") -> None:
+    """Raise ValueError for a configuration of an earlier version, whose gate was a logarithm, where it has a gate."""
+    if (
+        config.geometry_gate_init is not None
+        and config.geometry_source != "none"
+        and config.geometry_placement == "segment"
+    ):
+        raise ValueError(
+            "This checkpoint is of an earlier version, whose gate was stored as a logarithm (geometry_gate_init); write a "
+            "new one with `pi05-geometry convert CHECKPOINT OUTPUT` and train that by --policy.path, since the state of its "
+            "optimiser does not carry over."
+        )

@@ -1,0 +1,99 @@
+"""Where a dataset keeps the calibration of its cameras.
+
+It stands in `meta/info.json`, in the `info` of the feature that holds the camera's depth (its images, for a camera without
+depth), beside LeRobot's own `is_depth_map` and `depth_unit`:
+
+```json
+"observation.images.front_depth": {"dtype": "image", ..., "info": {"is_depth_map": true, "depth_unit": "mm",
+    "calibration": {"frame": "base", "intrinsics": [600.0, 600.0, 319.5, 239.5], "size": [640, 480], "extrinsics": null}}}
+```
+
+LeRobot's tools carry a feature's `info` along: deleting, splitting and recomputing statistics keep it, and merging
+refuses datasets whose `info` differs, as two rigs' does. A file `meta/calibration.json` (see calibration.py) is read too;
+these tools drop it. An entry holds what the file says about one camera. LeRobot has no place for it yet (its issue 4417).
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..weight_files.files import write_whole
+from .calibration import BASE_FRAME, CALIBRATION_FILE, calibration_content, parse_calibration, read_calibration_file
+from .camera import CameraCalibration
+from .keys import camera_of, depth_camera_name, find_depth_keys, is_depth_key, is_depth_map
+
+INFO_ENTRY = "calibration"
+_INFO_FILE = Path("meta") / "info.json"
+
+
+def read_dataset_calibration(dataset_meta: Any, depth_keys: Mapping[str, str]) -> dict[str, CameraCalibration]:
+    """Calibration of a dataset's cameras; {} if it has none.
+
+    dataset_meta: LeRobot's metadata (`features`, `root`). depth_keys: camera -> key of its depth, where it is not LeRobot's.
+    Raises ValueError for an unusable entry, or if the two places contradict each other.
+    """
+    features, root = dataset_meta.features, Path(dataset_meta.root)
+    keys = _calibrated_features(features, depth_keys)
+    entries = {camera: dict(features[key]["info"][INFO_ENTRY]) for camera, key in keys.items()}
+    frames = {camera: entry.pop("frame", None) for camera, entry in entries.items()}
+    other = next((camera for camera, frame in frames.items() if frame != BASE_FRAME), None)
+    content = {"frame": BASE_FRAME if other is None else frames[other], "cameras": entries}
+    in_info = parse_calibration(content, root / _INFO_FILE) if entries else {}
+    file = root / "meta" / CALIBRATION_FILE
+    in_file = read_calibration_file(file) if file.is_file() else {}
+    for camera in in_info.keys() & in_file.keys():
+        if in_info[camera] != in_file[camera]:
+            raise ValueError(
+                f"Camera '{camera}' has two calibrations that differ, in {root / _INFO_FILE} (feature {keys[camera]}) and in "
+                f"{file}; delete the wrong one, or give the right one with --policy.calibration_path."
+            )
+    return in_file | in_info
+
+
+def write_dataset_calibration(
+    root: Path, cameras: Mapping[str, CameraCalibration], depth_keys: Mapping[str, str] | None = None
+) -> None:
+    """Store the calibration of cameras in the `info` of a dataset's features, where LeRobot's tools keep it.
+
+    depth_keys: as in `read_dataset_calibration`. Raises ValueError for a camera that the dataset does not have.
+    """
+    path = root / _INFO_FILE
+    info = json.loads(path.read_text())
+    content = calibration_content(cameras)
+    for camera in cameras:
+        key = _feature_of(camera, info["features"], depth_keys or {})
+        feature = info["features"][key]
+        entry = {"frame": content["frame"], **content["cameras"][camera]}
+        feature["info"] = {**(feature.get("info") or {}), INFO_ENTRY: entry}
+    write_whole(path, json.dumps(info, indent=4, ensure_ascii=False) + "\n")
+
+
+def _calibrated_features(features: Mapping[str, Any], depth_keys: Mapping[str, str]) -> dict[str, str]:
+    """Camera -> feature with its calibration. An entry with depth comes before one with colour images of the camera."""
+    named = {key: camera for camera, key in depth_keys.items()}
+    found: dict[str, str] = {}
+    for key in sorted(features, key=lambda key: _holds_depth(key, features[key], named)):  # depth last: it wins
+        if INFO_ENTRY in (features[key].get("info") or {}):
+            depth = _holds_depth(key, features[key], named)
+            camera = named.get(key) or (depth_camera_name(key) if depth else camera_of(key))
+            found[camera] = key
+    return found
+
+
+def _holds_depth(key: str, feature: Mapping[str, Any], named: Mapping[str, str]) -> bool:
+    return key in named or is_depth_key(key) or is_depth_map(feature)
+
+
+def _feature_of(camera: str, features: Mapping[str, Any], depth_keys: Mapping[str, str]) -> str:
+    """The feature that holds a camera's depth, or else its images."""
+    of_depth = find_depth_keys(features, depth_keys)
+    named = {key: name for name, key in of_depth.items()}
+    images = [key for key, feature in features.items() if feature["dtype"] in ("image", "video")]
+    depth = [key for key in images if _holds_depth(key, features[key], named)]
+    candidates = {camera_of(key): key for key in images if key not in depth}
+    candidates |= {named.get(key) or depth_camera_name(key): key for key in depth}
+    if camera not in candidates:
+        known = ", ".join(sorted(candidates)) or "none"
+        raise ValueError(f"The dataset has no camera '{camera}' to store a calibration of; its cameras are {known}.")
+    return candidates[camera]
