@@ -17,7 +17,7 @@ ROOT = SRC.parents[1]
 LAYERS = [
     {"model", "weight_files", "compat"},
     {"inference", "geometry", "data", "training"},
-    {"configuration_pi05_geometry"},
+    {"configuration_pi05_geometry", "configuration_checks"},
     {"processor_pi05_geometry"},
     {"modeling_pi05_geometry"},
     {"checkpoint", "precompute"},
