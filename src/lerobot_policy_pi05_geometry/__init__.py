@@ -3,7 +3,7 @@
 ```
    cli                                          the pi05-geometry command
    study                                        experiments: tasks x arms x seeds x conditions
-   inspect, planner, sim                        pictures and timings, memory planning, simulated RGB-D robots
+   inspect, planner, sim, serving               pictures and timings, memory planning, simulated RGB-D robots, robots elsewhere
    checkpoint, precompute                       checkpoints loaded, merged and converted; features computed in advance
    modeling_, processor_                        LeRobot's entry points: the policy and its processors
    configuration_                               every setting of the policy
@@ -11,14 +11,15 @@
    model, weight_files                          the network; files that hold weights
 ```
 
-Imports run downwards only. Importing this package registers the policy type `pi05_geometry`, its processor steps and the
-environment type `metaworld_rgbd` with LeRobot, which imports it by itself because of its name.
+Imports run downwards only. Importing this package registers the policy types `pi05_geometry` and `pi05_geometry_remote`, the
+processor steps and the environment type `metaworld_rgbd` with LeRobot, which imports it by itself because of its name.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from .configuration_pi05_geometry import PI05GeometryConfig
 from .data.prompt import PortableTokenizerProcessorStep, PromptProcessorStep
+from .serving.remote.configuration_pi05_geometry_remote import PI05GeometryRemoteConfig
 from .sim.configuration import MetaworldRgbdEnv
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ __all__ = [
     "MetaworldRgbdEnv",
     "PI05GeometryConfig",
     "PI05GeometryPolicy",
+    "PI05GeometryRemoteConfig",
     "PortableTokenizerProcessorStep",
     "PromptProcessorStep",
     "__version__",

@@ -27,7 +27,7 @@ _FLOATS = ("<f4", "<f8")
 _IMAGE = (0, 0, 3)  # any height and width
 _NESTED = ("images", "depth", "extrinsics")
 _TASKS = ("prompt", "task")
-_GUIDANCE = (
+GUIDANCE_KEYS = (
     "inference_delay",
     "executed_steps",
     "execution_horizon",
@@ -105,7 +105,7 @@ class Inputs:
                 raise RequestError(f"The request has no {key}; expected {_describe(self.expected[key])}.")
         task = self._task(rest)
         noise = self._noise(rest.pop("noise", None))
-        guidance = self._guidance({name: rest.pop(name) for name in _GUIDANCE if name in rest})
+        guidance = self._guidance({name: rest.pop(name) for name in GUIDANCE_KEYS if name in rest})
         if rest:
             raise RequestError(
                 f"The request has {_short(next(iter(rest)))}, which this policy does not know; it takes "

@@ -1,0 +1,99 @@
+"""One robot's session with the server, over lost connections: a new connection is a new episode."""
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..client import PolicyClient, ServerLostError
+from ..inputs import GUIDANCE_KEYS
+
+logger = logging.getLogger(__name__)
+
+_PAUSE = 0.2  # seconds between two attempts to connect
+
+
+class RobotSession:
+    """connect: opens a session. reconnect: seconds to try for."""
+
+    def __init__(self, connect: Callable[[], PolicyClient], reconnect: float) -> None:
+        self._connect, self._reconnect = connect, reconnect
+        self._client: PolicyClient | None = None
+        self._last: Tensor | None = None  # the last chunk (S, A), as it was returned
+        self._request: dict[str, Any] = {}
+
+    @property
+    def client(self) -> PolicyClient:
+        """An open connection. Raises ServerLostError if there is none to be had in time."""
+        if self._client is None:
+            end = time.monotonic() + self._reconnect
+            while True:
+                try:
+                    self._client = self._connect()
+                    break
+                except ServerLostError:
+                    if time.monotonic() >= end:
+                        raise
+                    time.sleep(_PAUSE)
+        return self._client
+
+    def reset(self) -> None:
+        """A new episode; if the server is lost, the next connection is one."""
+        self._last = None
+        if self._client is not None:
+            try:
+                self._client.reset()
+            except ServerLostError as error:
+                self._lose(error)
+
+    def begin(self, request: dict[str, Any]) -> None:
+        """Send a request, whose chunk `finish` returns."""
+        self._request = request
+        try:
+            self.client.send(request)
+        except ServerLostError as error:
+            self._lose(error)
+
+    def finish(self) -> Tensor:
+        """The chunk (S, A) float32 of the request that was begun.
+
+        If the server was lost meanwhile, it is asked once more in a new session, with no chunk to continue. Raises
+        ServerLostError if it is lost again, RefusedError with its sentence.
+        """
+        answer = None
+        if self._client is not None:
+            try:
+                answer = self._client.receive()
+            except ServerLostError as error:
+                self._lose(error)
+        if answer is None:
+            answer = self.client.infer({k: v for k, v in self._request.items() if k not in GUIDANCE_KEYS})
+        self._last = torch.from_numpy(answer["actions"].copy())
+        return self._last
+
+    def executed(self, left_over: Tensor) -> int | None:
+        """How many actions of the last chunk come before `left_over` (T, A), which LeRobot may have cut or filled with zeros.
+
+        None if it is no part of the last chunk, as after a lost connection. Where several positions fit, the actions there
+        are equal, and the first is as good as any.
+        """
+        if self._last is None:
+            return None
+        for start in range(len(self._last)):
+            rest = self._last[start : start + len(left_over)]
+            if torch.equal(left_over[: len(rest)], rest) and not left_over[len(rest) :].any():
+                return start
+        return None
+
+    def close(self) -> None:
+        if self._client is not None:
+            self._client.close()
+
+    def _lose(self, error: ServerLostError) -> None:
+        logger.warning("%s A new session begins.", error)
+        if self._client is not None:
+            self._client.close()
+        self._client = self._last = None
