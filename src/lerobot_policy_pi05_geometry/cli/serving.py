@@ -27,8 +27,12 @@ def serve(
     fps: Annotated[float, typer.Option(help="With --lerobot: the robot's control rate.")] = 30.0,
 ) -> None:
     """Serve a checkpoint to robots on other machines: openpi's websocket protocol, or LeRobot's gRPC protocol."""
+    from ..serving.extras import require_extra
+
+    require_extra("serve", "websockets", "msgpack")
     sizes = None if batch_sizes is None else _sizes(batch_sizes)
     if lerobot:
+        require_extra("serve-lerobot", "grpc")
         from ..serving.lerobot_wire.grpc_server import serve_lerobot
 
         console.print(f"Loading {checkpoint} ...")

@@ -9,6 +9,7 @@
    engine               observations of a batch -> action chunks
    worker               the one thread that runs the engine, and the queue before it
    metadata             what a client is told first
+   keys                 the key that clients must know, and which addresses need one
    admission            who may connect: key, Origin, number of sessions; /healthz
    websocket_server     one session per connection
    client               the other end, for Python programs

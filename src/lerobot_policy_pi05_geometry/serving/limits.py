@@ -13,6 +13,10 @@ class BusyError(RequestError):
     """The server has no room for the request now."""
 
 
+class FailedError(RequestError):
+    """The server failed, and the request is not to blame; what happened is in the server's log."""
+
+
 @dataclass(frozen=True)
 class Limits:
     """Bounds that hold before anything is allocated.

@@ -10,9 +10,9 @@ from typing import NamedTuple
 from lerobot.processor import RenameObservationsProcessorStep
 
 from ..checkpoint.load import LoadedPolicy, load_policy
-from .admission import read_key, require_safe
 from .engine import PolicyEngine
 from .inputs import Inputs
+from .keys import read_key, require_safe
 from .limits import Limits
 from .metadata import describe
 from .websocket_server import WebsocketServer

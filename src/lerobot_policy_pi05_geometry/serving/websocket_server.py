@@ -41,7 +41,7 @@ class WebsocketServer:
     ) -> None:
         self._worker, self._inputs, self._limits = worker, inputs, limits
         self._metadata, self._seed, self._noise_shape = metadata, seed, noise_shape
-        self._admission = Admission(key, self._why_not, lambda: worker.healthy)
+        self._admission = Admission(key, self._why_full, self._why_ill)
         self._sessions: set[str] = set()
         self._answering = 0
         self._draining = False
@@ -97,7 +97,13 @@ class WebsocketServer:
         while self._answering and time.monotonic() < end:
             await asyncio.sleep(0.02)
 
-    def _why_not(self) -> str | None:
+    def _why_ill(self) -> str | None:
+        """Why requests are not answered."""
+        if self._draining:
+            return "The server is shutting down."
+        return None if self._worker.healthy else "The server is warming up, or its policy fails."
+
+    def _why_full(self) -> str | None:
         """Why no session can begin now."""
         if self._draining:
             return "The server is shutting down."

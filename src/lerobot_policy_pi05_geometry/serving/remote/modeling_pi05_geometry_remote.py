@@ -18,11 +18,15 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from ...geometry.keys import is_geometry_key
-from ..admission import read_key
-from ..client import PolicyClient, RefusedError
-from .configuration_pi05_geometry_remote import NO_TRAINING, PI05GeometryRemoteConfig
-from .robot_session import RobotSession
-from .rows import requests_of
+from ..extras import require_extra
+
+require_extra("serve", "websockets", "msgpack")
+
+from ..client import PolicyClient, RefusedError  # noqa: E402
+from ..keys import read_key  # noqa: E402
+from .configuration_pi05_geometry_remote import NO_TRAINING, PI05GeometryRemoteConfig  # noqa: E402
+from .robot_session import RobotSession  # noqa: E402
+from .rows import requests_of  # noqa: E402
 
 
 class PI05GeometryRemotePolicy(PreTrainedPolicy):
