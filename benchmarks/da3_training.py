@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
+import pandas
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from safetensors.torch import save_file
@@ -39,7 +40,7 @@ from lerobot_policy_pi05_geometry.geometry.da3 import (
 )
 from lerobot_policy_pi05_geometry.geometry.da3.weights import load_da3
 from lerobot_policy_pi05_geometry.geometry.feature_store import FeatureStore, Manifest
-from lerobot_policy_pi05_geometry.geometry.feature_store.fingerprint import dataset_hash, frame_files
+from lerobot_policy_pi05_geometry.geometry.feature_store.fingerprint import read_episodes
 from lerobot_policy_pi05_geometry.geometry.feature_store.match import STORES
 from lerobot_policy_pi05_geometry.geometry.feature_store.shards import writing
 from lerobot_policy_pi05_geometry.geometry.random_tokens import RandomSource
@@ -93,9 +94,12 @@ def write_store(root: Path, live: PI05GeometryConfig, feature_dim: int) -> Featu
     """A store of random features beside a dataset of which only the metadata exist."""
     (root / "meta").mkdir(parents=True, exist_ok=True)
     (root / "meta" / "info.json").write_text("{}")
-    manifest = Manifest(
-        str(live.da3_encoder), str(live.da3_hash), default_image_size(live.geometry_grid), live.da3_dtype,
-        live.geometry_grid, live.rgb_cameras(), feature_dim, dataset_hash(root), frame_files(root), FRAMES, SHARD_FRAMES,
+    (root / "meta" / "episodes").mkdir(exist_ok=True)
+    pandas.DataFrame({"episode_index": [0], "length": [FRAMES]}).to_parquet(root / "meta/episodes/file-000.parquet")
+    manifest = Manifest.new(
+        read_episodes(root), encoder=str(live.da3_encoder), encoder_hash=str(live.da3_hash),
+        image_size=default_image_size(live.geometry_grid), dtype=live.da3_dtype, grid=live.geometry_grid,
+        cameras=live.rgb_cameras(), feature_dim=feature_dim, dataset_files={}, shard_frames=SHARD_FRAMES,
     )  # fmt: skip
     folder = root / STORES / manifest.key
     folder.mkdir(parents=True)

@@ -29,6 +29,21 @@ def write_dataset(
         "action": {"dtype": "float32", "shape": (ACTION_DIM,), "names": None},
     }
     dataset = LeRobotDataset.create(REPO_ID, fps=FPS, features=features, root=root, use_videos=videos)
+    _record(dataset, lengths, size, seed)
+    dataset.finalize()
+    write_frame_quantiles(root, REPO_ID)
+    return root
+
+
+def add_episodes(root: Path, lengths: tuple[int, ...], size: int = 28, seed: int = 1) -> Path:
+    """Record episodes in addition, as `lerobot-record --resume=true` does."""
+    dataset = LeRobotDataset.resume(REPO_ID, root=root)
+    _record(dataset, lengths, size, seed)
+    dataset.finalize()
+    return root
+
+
+def _record(dataset: LeRobotDataset, lengths: tuple[int, ...], size: int, seed: int) -> None:
     random = np.random.default_rng(seed)
     ramp = np.linspace(0.2, 1.0, size)[:, None, None] * np.linspace(0.5, 1.0, size)[None, :, None]
     for length in lengths:
@@ -45,6 +60,3 @@ def write_dataset(
                 }
             )
         dataset.save_episode()
-    dataset.finalize()
-    write_frame_quantiles(root, REPO_ID)
-    return root

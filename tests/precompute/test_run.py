@@ -198,10 +198,9 @@ def test_a_disk_that_fills_up_loses_nothing(whole, tmp_path, monkeypatch):
     assert files(work.folder) == files(whole.folder)
 
 
-def test_a_store_begun_with_files_of_another_length(whole):
-    changed = dataclasses.replace(whole.manifest, shard_frames=8)
-    with pytest.raises(ValueError, match=r"begun with 7 frames per file, not 8; go on with --shard-frames=7"):
-        begin(dataclasses.replace(whole, manifest=changed))
+def test_a_store_begun_with_files_of_another_length(whole, dataset):
+    with pytest.raises(ValueError, match=r"begun with 7 frames per file, not 8; continue with --shard-frames=7"):
+        prepare(dataset, whole.manifest.encoder, 3, image_size=42, output=whole.folder.parent, shard_frames=8)
 
 
 def test_settings_that_cannot_be(dataset, whole, tmp_path):

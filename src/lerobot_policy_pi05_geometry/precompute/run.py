@@ -1,7 +1,8 @@
-"""A store's files, one after the other. Interrupted and started again, it goes on where it stopped.
+"""Computes the files of a store, one after the other. Interrupted and started again, it continues where it stopped.
 
 Processes share the work file by file: rank r of W takes files r, r + W, ... Each file is written by one process at a time
-(a lock), and appears under its name when it is complete, so the store is finished when all its files are there.
+(a lock), and gets its name when it is complete, so the store is finished when all its files exist. When the dataset has more
+episodes than the store, files for the new frames are added.
 """
 
 import errno
@@ -18,8 +19,8 @@ from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..geometry.da3 import Da3Source
 from ..geometry.da3.weights import load_da3
 from ..geometry.feature_store import FeatureStore, Manifest, read_manifest
-from ..geometry.feature_store.fingerprint import dataset_hash, frame_files
-from ..geometry.feature_store.manifest import MANIFEST_FILE
+from ..geometry.feature_store.fingerprint import changed_file, frame_files, read_episodes
+from ..geometry.feature_store.manifest import MANIFEST_FILE, stores_in
 from ..geometry.feature_store.match import STORES
 from ..geometry.feature_store.reader import missing_shards
 from ..geometry.feature_store.shards import lock_beside, writing
@@ -30,7 +31,7 @@ SHARD_FRAMES = 512  # 100 MB for one camera of DA3-BASE at 8 x 8: small enough t
 
 @dataclass(frozen=True)
 class Precompute:
-    """What is to be computed: the frames, the source that looks at them, and the store."""
+    """What is to be computed: the frames, the source that encodes them, and the store."""
 
     frames: Frames
     source: Da3Source
@@ -53,7 +54,7 @@ class Precompute:
         found in an unfinished file.
 
         Batches begin at multiples of `batch_size` within a file, wherever this was interrupted: the files are then the same
-        to the byte. Raises OSError, saying that nothing is lost, when the disk is full.
+        to the byte. Raises OSError when the disk is full; what is computed is kept.
         """
         if batch_size < 1:
             raise ValueError(f"--batch-size must be at least 1, got {batch_size}.")
@@ -89,7 +90,7 @@ def prepare(
     """Find the encoder and the cameras, as a policy of these settings would, and the store that belongs to them.
 
     output: folder for stores; None: the dataset's own. Writes nothing.
-    Raises FileNotFoundError or ValueError, with one sentence, for what cannot be.
+    Raises FileNotFoundError or ValueError, with one sentence, for what is not found or does not fit.
     """
     if shard_frames < 1:
         raise ValueError(f"--shard-frames must be at least 1, got {shard_frames}.")
@@ -110,7 +111,8 @@ def prepare(
         raise ValueError(f"The dataset {root} has no RGB images, so there is nothing to compute features from.")
     source = Da3Source(keys, grid, load_da3(config), config.da3_image_size)
     assert source.encoder.content_hash is not None
-    manifest = Manifest(
+    manifest = Manifest.new(
+        read_episodes(root),
         encoder=encoder,
         encoder_hash=source.encoder.content_hash,
         image_size=source.image_size,
@@ -118,19 +120,41 @@ def prepare(
         grid=grid,
         cameras=keys,
         feature_dim=source.feature_dim,
-        dataset_hash=dataset_hash(root),
         dataset_files=frame_files(root),
-        frames=dataset.meta.total_frames,
         shard_frames=shard_frames,
     )
-    folder = (root / STORES if output is None else output) / manifest.key
-    return Precompute(Frames(dataset, list(keys.values())), source, manifest, folder)
+    stores = root / STORES if output is None else output
+    manifest = _extending(stores, root, manifest) or manifest
+    return Precompute(Frames(dataset, list(keys.values())), source, manifest, stores / manifest.key)
+
+
+def _extending(stores: Path, root: Path, wanted: Manifest) -> Manifest | None:
+    """The store that holds most of the wanted frames, extended to all of them; None if no store can be.
+
+    It must have the same recipe, and the dataset must begin with the store's episodes, in files that have not changed.
+    """
+    begun = [
+        manifest
+        for manifest in stores_in(stores).values()
+        if manifest.recipe == wanted.recipe
+        and wanted.episodes.begins_with(manifest.episodes)
+        and changed_file(root, manifest.dataset_files, allow_new=True) is None
+    ]
+    if not begun:
+        return None
+    longest = max(begun, key=lambda manifest: manifest.frames)
+    if longest.shard_frames != wanted.shard_frames:
+        raise ValueError(
+            f"The store {stores / longest.key} was begun with {longest.shard_frames} frames per file, not "
+            f"{wanted.shard_frames}; continue with --shard-frames={longest.shard_frames}, or delete it."
+        )
+    return longest.extended(wanted.episodes, wanted.dataset_files)
 
 
 def begin(work: Precompute) -> None:
-    """Make the store's folder and manifest, if they are not there, after looking whether the disk can hold the rest.
+    """Write the store's folder and manifest, where they do not exist or the dataset has grown.
 
-    Raises OSError if it cannot, and ValueError for a store begun with files of another length.
+    Raises OSError if the disk cannot hold the rest of the features.
     """
     needed, free = disk_needed(work), free_bytes(work.folder)
     if needed > free:
@@ -140,14 +164,8 @@ def begin(work: Precompute) -> None:
         )
     work.folder.mkdir(parents=True, exist_ok=True)
     with lock_beside(work.folder, "manifest"):
-        if not (work.folder / MANIFEST_FILE).exists():
+        if not (work.folder / MANIFEST_FILE).exists() or read_manifest(work.folder) != work.manifest:
             work.manifest.write(work.folder)
-    begun = read_manifest(work.folder)
-    if begun.shard_frames != work.manifest.shard_frames:
-        raise ValueError(
-            f"The store {work.folder} was begun with {begun.shard_frames} frames per file, not {work.manifest.shard_frames}; "
-            f"go on with --shard-frames={begun.shard_frames}, or delete it."
-        )
 
 
 def disk_needed(work: Precompute) -> int:

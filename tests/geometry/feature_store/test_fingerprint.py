@@ -1,58 +1,63 @@
-"""A dataset that changed where it matters is another one."""
+"""A dataset that changed where it matters is another one; one that grew begins as it did."""
 
 import shutil
 
 import pytest
+from lerobot.datasets.dataset_tools import modify_tasks
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_policy_pi05_geometry.geometry.feature_store.fingerprint import changed_file, dataset_hash, frame_files
+from lerobot_policy_pi05_geometry.data.quantiles import write_frame_quantiles
+from lerobot_policy_pi05_geometry.geometry.feature_store.fingerprint import changed_file, frame_files, read_episodes
+from tests.datasets import REPO_ID, add_episodes, write_dataset
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data") / "tiny", (4, 3))
 
 
 @pytest.fixture
-def root(tmp_path):
-    folder = tmp_path / "dataset"
-    for name in ("meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet",
-                 "meta/episodes/chunk-000/file-001.parquet", "data/chunk-000/file-000.parquet",
-                 "videos/observation.images.front/chunk-000/file-000.mp4"):  # fmt: skip
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(f"content of {name}")
-    return folder
+def root(original, tmp_path):
+    """A copy that a test may change."""
+    return shutil.copytree(original, tmp_path / "data")
 
 
-def test_the_hash_is_of_the_tables_that_say_where_frames_are(root, tmp_path):
-    before = dataset_hash(root)
-    assert dataset_hash(shutil.copytree(root, tmp_path / "copy")) == before
-    for name in (
-        "meta/stats.json",
-        "meta/tasks.parquet",
-        "data/chunk-000/file-000.parquet",
-        "geometry/a/manifest.json",
-    ):
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text("changed")
-        assert dataset_hash(root) == before, name
-    found = {before}
-    for name in ("meta/info.json", "meta/episodes/chunk-000/file-001.parquet"):
-        (root / name).write_text("changed")
-        found.add(dataset_hash(root))
-    (root / "meta/episodes/chunk-000/file-001.parquet").rename(root / "meta/episodes/chunk-000/file-002.parquet")
-    found.add(dataset_hash(root))
-    assert len(found) == 4
+def test_episodes_are_told_apart_by_their_length_and_statistics(original, root, tmp_path):
+    before = read_episodes(original)
+    assert before.frames == [4, 3]
+    assert len(set(before.hashes)) == 2
+    assert read_episodes(root) == before
+    write_frame_quantiles(root, REPO_ID)
+    (root / "meta" / "info.json").write_text((root / "meta" / "info.json").read_text() + " ")
+    modify_tasks(LeRobotDataset(REPO_ID, root=root), new_task="pull")
+    assert read_episodes(root) == before, "features depend on none of these"
+    assert read_episodes(write_dataset(tmp_path / "other", (4, 3), seed=1)).hashes != before.hashes
+
+
+def test_a_dataset_that_grew_begins_as_it_did(original, root):
+    before = read_episodes(original)
+    add_episodes(root, (2, 5))
+    after = read_episodes(root)
+    assert after.frames == [4, 3, 2, 5]
+    assert after.begins_with(before)
+    assert not before.begins_with(after)
+    assert changed_file(root, frame_files(original), allow_new=True) is None
+    assert "file-001" in changed_file(root, frame_files(original), allow_new=False)
 
 
 def test_a_file_of_frames_that_changed_is_named(root):
     recorded = frame_files(root)
-    assert list(recorded) == [
-        "data/chunk-000/file-000.parquet",
-        "videos/observation.images.front/chunk-000/file-000.mp4",
-    ]
-    assert changed_file(root, recorded) is None
-    (root / "data/chunk-000/file-000.parquet").unlink()  # a partial download
-    assert changed_file(root, recorded) is None
-    video = "videos/observation.images.front/chunk-000/file-000.mp4"
-    (root / video).write_text("changed")
-    assert changed_file(root, recorded) == video
+    assert list(recorded) == ["data/chunk-000/file-000.parquet"]
+    assert changed_file(root, recorded, allow_new=False) is None
+    (data,) = (root / "data").rglob("*.parquet")
+    content = data.read_bytes()
+    data.unlink()  # a partial download
+    assert changed_file(root, recorded, allow_new=False) is None
+    data.write_bytes(content + b" ")
+    for allow_new in (True, False):
+        assert changed_file(root, recorded, allow_new) == "data/chunk-000/file-000.parquet"
 
 
 def test_no_dataset(tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no LeRobotDataset"):
-        dataset_hash(tmp_path)
+        read_episodes(tmp_path)

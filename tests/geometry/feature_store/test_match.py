@@ -14,9 +14,10 @@ from lerobot.transforms import ImageTransformsConfig
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from lerobot_policy_pi05_geometry.precompute import begin, prepare
 from lerobot_policy_pi05_geometry.precompute.augmentation import refuse_augmentation
-from tests.datasets import REPO_ID, write_dataset
+from tests.datasets import REPO_ID, add_episodes, write_dataset
 from tests.entry_points import FRONT, GEOMETRY, WRIST, chunk_of, make_batch, make_config, redraw, without
 from tests.geometry.da3.tiny import write_tiny
+from tests.geometry.feature_store.test_shards import files
 
 INDICES = (17, 0, 9, 25)
 
@@ -161,26 +162,66 @@ def test_no_store(root, tmp_path):
         make_stored(None)
 
 
-def test_a_changed_dataset(root):
+def test_a_changed_dataset(root, tmp_path):
     folder = store_of(root)
-    info = root / "meta" / "info.json"
-    before = info.read_text()
-    info.write_text(before + " ")
+    other = write_dataset(tmp_path / "other", seed=5)
+    shutil.copytree(root / "geometry", other / "geometry")
     with pytest.raises(
-        ValueError, match=rf"No feature store in .* fits: {folder.name}: the dataset {root} has changed since"
+        ValueError, match=rf"No feature store in .* fits: {folder.name}: the dataset {other} has changed since"
     ):
-        make_stored(root)
+        make_stored(other)
     with pytest.raises(
-        ValueError, match=rf"store {folder} does not fit: the dataset {root} has changed since, or is another"
+        ValueError, match=rf"store {folder} does not fit: the dataset {other} has changed since, or is another"
     ):
-        make_stored(root, features_path=str(folder))
-    info.write_text(before)
+        make_stored(other, features_path=str(folder))
     (data,) = (root / "data").rglob("*.parquet")
     data.write_bytes(data.read_bytes() + b" ")
     with pytest.raises(
         ValueError, match=rf"the dataset's {data} has another size than when the features were computed"
     ):
         make_stored(root)
+
+
+def test_what_features_do_not_depend_on_may_change(root):
+    """Calibrating the cameras of a dataset, or recomputing its statistics, invalidates no feature."""
+    (root / "meta" / "info.json").write_text((root / "meta" / "info.json").read_text() + " ")
+    (root / "meta" / "stats.json").unlink()
+    make_stored(root)
+
+
+def test_more_episodes_are_computed_alone(root, original):
+    """One more recording: the files of the old frames stay, and training reads old frames and new ones."""
+    encoder = original.parent / "encoder"
+    folder, before = store_of(root), files(store_of(root))
+    old = make_stored(root).geometry.source(frames_of(root)).features
+    add_episodes(root, (6,))
+    with pytest.raises(ValueError, match=r"has 1 more episode\(s\) since; .* which computes the new frames alone"):
+        make_stored(root)
+    dataset = LeRobotDataset(REPO_ID, root=root, return_uint8=True)
+    work = prepare(dataset, str(encoder), 3, image_size=42, shard_frames=10)
+    assert work.folder == folder
+    begin(work)
+    asked: list[int] = []
+    work.run(4, on_progress=lambda frames, found: asked.append(frames))
+    assert sum(asked) == 6
+    after = files(folder)
+    assert {name: after[name] for name in before if name.startswith("shard")} == {
+        name: content for name, content in before.items() if name.startswith("shard")
+    }
+    grown = make_stored(root)
+    assert torch.equal(grown.geometry.source(frames_of(root)).features, old)
+    batch = frames_of(root, (26, 31))
+    live = make_stored(None, geometry_source="da3", da3_encoder=str(encoder), da3_image_size=42)
+    expected = live.geometry.source(without(batch, "index")).features
+    torch.testing.assert_close(grown.geometry.source(batch).features, expected, rtol=2**-7, atol=5e-3)
+    again = prepare(dataset, str(encoder), 3, image_size=42, shard_frames=10)
+    assert (again.folder, again.missing()) == (folder, [])
+
+
+def test_episodes_that_changed_make_another_store(root, original, tmp_path):
+    other = write_dataset(tmp_path / "other", (9, 5, 12, 3), seed=5)
+    shutil.copytree(root / "geometry", other / "geometry")
+    assert compute(other, original.parent / "encoder") != other / "geometry" / store_of(root).name
 
 
 def test_another_grid_camera_order_or_precision(root):

@@ -1,6 +1,5 @@
 """A store's files: whatever is cut off or changed is found, and what was written is read back."""
 
-import dataclasses
 import shutil
 from collections import namedtuple
 from pathlib import Path
@@ -12,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_policy_pi05_geometry.geometry.feature_store import FeatureStore, Manifest, read_manifest
+from lerobot_policy_pi05_geometry.geometry.feature_store.fingerprint import Episodes
+from lerobot_policy_pi05_geometry.geometry.feature_store.manifest import stores_in
 from lerobot_policy_pi05_geometry.geometry.feature_store.shards import ShardWriter, writing
 
 
-def make_manifest(frames=13, shard_frames=5, views=2, grid=2, width=3, **changes) -> Manifest:
+def make_manifest(frames=13, shard_frames=5, views=2, grid=2, width=3, episode="1" * 16, **changes) -> Manifest:
     settings = {
         "encoder": "some/encoder",
         "encoder_hash": "0" * 64,
@@ -24,12 +25,10 @@ def make_manifest(frames=13, shard_frames=5, views=2, grid=2, width=3, **changes
         "grid": grid,
         "cameras": {f"camera{i}": f"observation.images.camera{i}" for i in range(views)},
         "feature_dim": width,
-        "dataset_hash": "1" * 64,
         "dataset_files": {"data/a.parquet": 10},
-        "frames": frames,
         "shard_frames": shard_frames,
     }
-    return Manifest(**{**settings, **changes})
+    return Manifest.new(Episodes([frames], [episode]), **{**settings, **changes})
 
 
 def make_features(manifest: Manifest, seed=0) -> torch.Tensor:
@@ -76,17 +75,40 @@ def test_the_key_is_of_what_features_depend_on():
         "image_size": 42,
         "dtype": "float32",
         "grid": 3,
-        "dataset_hash": "3" * 64,
+        "episode": "3" * 16,
         "frames": 14,
-        "feature_dim": 4,
+        "width": 4,
         "dataset_files": {"data/a.parquet": 11},
         "cameras": dict(reversed(make_manifest().cameras.items())),  # another reference view
     }
     for name, value in same.items():
         assert make_manifest(**{name: value}).key == key, name
     for name, value in other.items():
-        assert dataclasses.replace(make_manifest(), **{name: value}).key != key, name
-    assert {*same, *other, "format"} == {field.name for field in dataclasses.fields(Manifest)}
+        assert make_manifest(**{name: value}).key != key, name
+
+
+@given(st.integers(1, 12), st.integers(1, 6), st.lists(st.integers(1, 9), max_size=3), st.randoms())
+def test_a_store_that_grows_keeps_its_files_and_its_frames(tmp_path_factory, frames, shard_frames, more, random):
+    folder, manifest = tmp_path_factory.mktemp("store"), make_manifest(frames, shard_frames)
+    every = torch.randn(frames + sum(more), *manifest.shape).bfloat16()
+    write_store(folder, manifest, every)
+    for count in more:
+        before = {name: content for name, content in files(folder / manifest.key).items() if name.startswith("shard")}
+        old = manifest.episodes
+        episodes = Episodes([*old.frames, count], [*old.hashes, f"{len(old.hashes):016d}"])
+        grown = manifest.extended(episodes, {"data/a.parquet": 10, "data/b.parquet": 5})
+        assert grown.key == manifest.key
+        write_store(folder, grown, every)
+        after = files(folder / grown.key)
+        assert {name: after[name] for name in before} == before
+        manifest = grown
+    store = FeatureStore(folder / manifest.key)
+    indices = [random.randrange(manifest.frames) for _ in range(9)]
+    assert torch.equal(store.read(indices), every[indices])
+    assert sum(store.verify()) == len(every) * manifest.record_bytes
+    assert [i for shard in range(manifest.shards) for i in manifest.frames_of(shard)] == list(range(len(every)))
+    assert read_manifest(store.folder) == manifest
+    assert manifest.extended(manifest.episodes, manifest.dataset_files) == manifest
 
 
 def test_the_whole_store_is_read_ahead_if_memory_can_hold_it(tmp_path, monkeypatch):
@@ -203,13 +225,14 @@ def test_a_manifest_that_is_none(tmp_path):
         read_manifest(tmp_path)
     folder = write_store(tmp_path)
     text = (folder / "manifest.json").read_text()
-    for broken in (text[:50], "[1]", text.replace('"frames"', '"pictures"')):
+    for broken in (text[:50], "[1]", text.replace('"parts"', '"pieces"')):
         (folder / "manifest.json").write_text(broken)
         with pytest.raises(ValueError, match=r"manifest.json is damaged"):
             read_manifest(folder)
     (folder / "manifest.json").write_text(text.replace('"grid": 2', '"grid": 1'))
     with pytest.raises(ValueError, match=r"was changed by hand"):
         read_manifest(folder)
-    (folder / "manifest.json").write_text(text.replace('"format": 1', '"format": 2'))
-    with pytest.raises(ValueError, match=r"has format 2, this version reads 1"):
+    (folder / "manifest.json").write_text(text.replace('"format": 2', '"format": 1'))
+    with pytest.raises(ValueError, match=r"has format 1, this version reads 2; run pi05-geometry precompute again"):
         read_manifest(folder)
+    assert stores_in(tmp_path) == {}

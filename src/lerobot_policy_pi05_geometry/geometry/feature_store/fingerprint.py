@@ -1,25 +1,59 @@
-"""What tells a dataset from a changed one, without reading its images."""
+"""What tells a dataset, or one of its episodes, from a changed one, without reading its images."""
 
 import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow.parquet as parquet
+
+# Statistics of columns that say where an episode stands in the dataset, and not what is in it.
+_PLACES = ("index", "episode_index", "frame_index", "task_index", "timestamp")
+_LENGTH, _EPISODE, _STATISTICS = "length", "episode_index", "stats/"
+_HASH_DIGITS = 16
 
 
-def dataset_hash(root: Path) -> str:
-    """SHA-256 over meta/info.json and the episode tables (meta/episodes/**/*.parquet): their paths and contents.
+class Episodes(NamedTuple):
+    """Episodes of a dataset in order: how many frames each has, and a hash of what its table says about it."""
 
-    The episode tables say which frames are where and hold statistics of every episode's images. meta/stats.json,
-    meta/tasks.parquet and a calibration are left out: features do not depend on them.
-    Raises FileNotFoundError if there is no dataset at `root`.
+    frames: list[int]
+    hashes: list[str]
+
+    def begins_with(self, other: "Episodes") -> bool:
+        """Whether these are the other's episodes, and perhaps more of them."""
+        count = len(other.hashes)
+        return self.hashes[:count] == other.hashes and self.frames[:count] == other.frames
+
+
+def read_episodes(root: Path) -> Episodes:
+    """Episodes of a LeRobotDataset, from its tables meta/episodes/**/*.parquet.
+
+    A hash is of the episode's length and its statistics, those of its images included. Its number, its task and its place in the
+    files are left out, and so is everything else in `meta/`: features do not depend on them.
+    Raises FileNotFoundError if there is no dataset at `root`, ValueError for a table without episodes.
     """
     if not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{root} holds no LeRobotDataset (meta/info.json is missing).")
-    digest = hashlib.sha256()
-    for path in [root / "meta" / "info.json", *sorted((root / "meta" / "episodes").rglob("*.parquet"))]:
-        content = path.read_bytes()
-        digest.update(f"{path.relative_to(root).as_posix()} {len(content)}\n".encode())
-        digest.update(content)
-    return digest.hexdigest()
+    found: dict[int, tuple[int, str]] = {}
+    for path in sorted((root / "meta" / "episodes").rglob("*.parquet")):
+        names = parquet.read_schema(path).names
+        if not {_EPISODE, _LENGTH} <= set(names):
+            raise ValueError(f"{path} is no table of episodes: it has no columns {_EPISODE} and {_LENGTH}.")
+        columns = sorted(name for name in names if _describes_content(name))
+        rows: list[dict[str, Any]] = parquet.read_table(path, columns=[_EPISODE, *columns]).to_pylist()
+        for row in rows:
+            text = json.dumps([row[name] for name in columns], sort_keys=True)
+            digest = hashlib.sha256(f"{columns} {text}".encode()).hexdigest()[:_HASH_DIGITS]
+            found[row[_EPISODE]] = (row[_LENGTH], digest)
+    ordered = [found[episode] for episode in sorted(found)]
+    return Episodes([frames for frames, _ in ordered], [digest for _, digest in ordered])
+
+
+def _describes_content(column: str) -> bool:
+    if column == _LENGTH:
+        return True
+    return column.startswith(_STATISTICS) and column.split("/")[1] not in _PLACES
 
 
 def frame_files(root: Path) -> dict[str, int]:
@@ -28,9 +62,14 @@ def frame_files(root: Path) -> dict[str, int]:
     return {path.relative_to(root).as_posix(): path.stat().st_size for path in sorted(found)}
 
 
-def changed_file(root: Path, recorded: Mapping[str, int]) -> str | None:
-    """The first file of frames that is not the recorded one; one that is absent, as in a partial download, is no change."""
+def changed_file(root: Path, recorded: Mapping[str, int], allow_new: bool) -> str | None:
+    """The first file of frames that is not the recorded one. One that is absent, as in a partial download, is no change.
+
+    allow_new: whether there may be files that are not recorded, as after more episodes were recorded.
+    """
     for name, size in frame_files(root).items():
+        if name not in recorded and allow_new:
+            continue
         if recorded.get(name) != size:
             return name
     return None

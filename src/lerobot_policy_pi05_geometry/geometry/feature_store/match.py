@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from ..da3 import default_image_size
 from ..da3.weights import backbone_hash, find_encoder
 from . import FeatureStore, Manifest, read_manifest
-from .fingerprint import changed_file, dataset_hash
-from .manifest import MANIFEST_FILE
+from .fingerprint import changed_file, read_episodes
+from .manifest import MANIFEST_FILE, stores_in
 
 if TYPE_CHECKING:
     from ...configuration_pi05_geometry import PI05GeometryConfig
@@ -36,9 +36,15 @@ def open_store(config: "PI05GeometryConfig", root: Path) -> FeatureStore:
 def misfit(config: "PI05GeometryConfig", manifest: Manifest, root: Path) -> str | None:
     """Why a store is none for this policy and the dataset at `root`, and what to do; None if it is one."""
     anew = "run pi05-geometry precompute for it"
-    if manifest.dataset_hash != dataset_hash(root):
-        return f"the dataset {root} has changed since, or is another one (meta/info.json, meta/episodes); {anew}"
-    changed = changed_file(root, manifest.dataset_files)
+    episodes = read_episodes(root)
+    if episodes != manifest.episodes:
+        if not episodes.begins_with(manifest.episodes):
+            return f"the dataset {root} has changed since, or is another one (meta/episodes); {anew}"
+        added = len(episodes.hashes) - len(manifest.episodes.hashes)
+        return (
+            f"the dataset {root} has {added} more episode(s) since; {anew} again, which computes the new frames alone"
+        )
+    changed = changed_file(root, manifest.dataset_files, allow_new=False)
     if changed is not None:
         return f"the dataset's {root / changed} has another size than when the features were computed; {anew}"
     if manifest.grid != config.geometry_grid:
@@ -55,7 +61,7 @@ def misfit(config: "PI05GeometryConfig", manifest: Manifest, root: Path) -> str 
             "them may be in --rename_map)"
         )
     size = config.da3_image_size
-    if size is None:  # a policy that has seen images already saw them in the default size
+    if size is None:  # a policy that was trained on images used the default size
         size = manifest.image_size if config.da3_hash is None else default_image_size(config.geometry_grid)
     for name, theirs, ours in (
         ("da3_image_size", manifest.image_size, size),
@@ -86,13 +92,14 @@ def _other_encoder(config: "PI05GeometryConfig", manifest: Manifest) -> str | No
 def _find(config: "PI05GeometryConfig", root: Path) -> Path:
     """The one store beside the dataset that fits."""
     beside = root / STORES
-    found = sorted(path.parent for path in beside.glob(f"*/{MANIFEST_FILE}"))
+    found = stores_in(beside)
     if not found:
+        older = " of this version" if any(beside.glob(f"*/{MANIFEST_FILE}")) else ""
         raise FileNotFoundError(
-            f"geometry_source=features needs a feature store, and {beside} has none; run pi05-geometry precompute "
+            f"geometry_source=features needs a feature store, and {beside} has none{older}; run pi05-geometry precompute "
             f"--dataset.root={root}, or name one by --policy.features_path."
         )
-    reasons = {folder: misfit(config, read_manifest(folder), root) for folder in found}
+    reasons = {folder: misfit(config, manifest, root) for folder, manifest in found.items()}
     fitting = [folder for folder, reason in reasons.items() if reason is None]
     if not fitting:
         told = "; and ".join(f"{folder.name}: {reason}" for folder, reason in reasons.items())

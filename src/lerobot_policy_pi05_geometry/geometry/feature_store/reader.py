@@ -1,4 +1,4 @@
-"""Frames of a store by dataset index, in any order."""
+"""Reading a store: frames by dataset index, in any order."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
@@ -12,15 +12,15 @@ from torch import Tensor
 from .manifest import Manifest, read_manifest
 from .shards import is_good, map_records
 
-_SHARE_OF_MEMORY = 0.5  # of what is available; a store larger than that would push itself out of the page cache again
+_SHARE_OF_MEMORY = 0.5  # of the free memory; a larger store would evict its own pages from the cache
 _BLOCK = 1 << 23  # bytes
 _MEND = "delete it and run pi05-geometry precompute again, which computes this file alone"
 
 
 class FeatureStore:
-    """A finished store. Opening looks at the names and sizes of its files; a frame is checked when it is first read.
+    """A finished store. Opening checks the names and sizes of its files; a frame's checksum is checked when it is first read.
 
-    Reading everything at the start, to check it, would take minutes for a large store.
+    Checking the checksums of a large store at the start would take minutes.
     Raises FileNotFoundError or ValueError, with one sentence, for a store that is unfinished or has a wrong file.
     """
 
@@ -31,7 +31,7 @@ class FeatureStore:
             raise FileNotFoundError(
                 f"The feature store {folder} is not finished: {len(missing)} of {self.manifest.shards} files are missing, "
                 f"beginning with {self.manifest.shard_path(folder, missing[0]).name}; run pi05-geometry precompute again, "
-                "which goes on where it stopped."
+                "which continues where it stopped."
             )
         for shard in range(self.manifest.shards):
             self._check_size(shard)
@@ -39,7 +39,7 @@ class FeatureStore:
         self._checked = torch.zeros(self.manifest.frames, dtype=torch.bool)
 
     def read(self, indices: Sequence[int], pin: bool = False) -> Tensor:
-        """Features (B, V, G, C) bfloat16 of frames. pin: into page-locked memory, for a copy that a GPU need not wait for.
+        """Features (B, V, G, C) bfloat16 of frames. pin: into page-locked memory, so that the copy to a GPU is asynchronous.
 
         Raises ValueError for a frame that the store does not have, or that is damaged.
         """
@@ -51,7 +51,7 @@ class FeatureStore:
     def read_ahead(self) -> Thread | None:
         """Read every file once, in the background, so that shuffled frames soon come from memory; None if they do not fit.
 
-        The policy learns too late which frames it gets to ask for them in advance, so all of them are asked for.
+        A policy gets the indices of a batch together with the batch, so it cannot read single frames ahead.
         """
         size = self.manifest.frames * self.manifest.record_bytes
         if size > _SHARE_OF_MEMORY * psutil.virtual_memory().available:
@@ -67,7 +67,7 @@ class FeatureStore:
                 with self.manifest.shard_path(self.folder, shard).open("rb", buffering=0) as file:
                     while file.readinto(block):
                         pass
-            except OSError:  # whoever needs a frame of it is told
+            except OSError:  # reading a frame of this file raises the error
                 return
 
     def verify(self) -> Iterator[int]:
@@ -89,7 +89,8 @@ class FeatureStore:
                 f"The feature store {self.folder} has no frame {index} (it has 0 to {self.manifest.frames - 1}): the batch is "
                 "not from the dataset that it was made of; run pi05-geometry precompute for this one."
             )
-        shard, row = divmod(index, self.manifest.shard_frames)
+        shard = self.manifest.shard_of(index)
+        row = index - self.manifest.frames_of(shard).start
         if shard not in self._maps:
             self._check_size(shard)
             path = self.manifest.shard_path(self.folder, shard)
