@@ -39,6 +39,10 @@ from tests.model.helpers import randomise
 
 Tensors = dict[str, Tensor]
 
+# Settings of LeRobot 0.6.2's π0.5 that 0.6.1's does not have.
+ONLY_0_6_2 = {"memory_frames", "memory_stride", "memory_temporal_attention_every", "rtc_training_max_delay"} | {
+    f"use_{kind}_memory" for kind in ("visual", "proprioceptive")
+}
 VLM_HEAD = "paligemma_with_expert.paligemma.lm_head.weight"
 EXPERT_HEAD = "paligemma_with_expert.gemma_expert.lm_head.weight"
 EMBEDDING = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"

@@ -15,6 +15,7 @@ from tests.entry_points import FRONT, STATE, WRIST
 
 from .sources import (
     EMBEDDING,
+    ONLY_0_6_2,
     VLM_HEAD,
     Tensors,
     folder_contents,
@@ -117,11 +118,20 @@ def test_settings_carry_over(lerobot_source, converted):
     ours = json.loads((converted / "config.json").read_text())
     changed = {name for name in theirs.keys() & ours.keys() if theirs[name] != ours[name]}
     assert changed == {"type", "device"}
-    assert set(theirs) - set(ours) == {"compile_model", "compile_mode"}
+    assert set(theirs) - set(ours) - ONLY_0_6_2 <= {"compile_model", "compile_mode"}
     assert (ours["type"], ours["device"], ours["optimizer_lr"]) == ("pi05_geometry", None, 1.25e-5)
     assert list(ours["input_features"]) == [FRONT, WRIST, STATE]
     assert (ours["geometry_positions"], ours["geometry_gate_openness"]) == ("parallel", 1e-7)
     assert ours["calibration"].keys() == {"front", "wrist"}
+
+
+@pytest.mark.parametrize("switch", ["use_visual_memory", "use_proprioceptive_memory"])
+def test_a_source_with_memory_is_refused(tmp_path, switch):
+    """LeRobot 0.6.2's π0.5 may look at earlier observations; without them its weights act differently."""
+    convert(write_lerobot(tmp_path / "off", **{switch: False}, memory_frames=6), tmp_path / "output")
+    with pytest.raises(ValueError, match="remembers earlier observations"):
+        convert(write_lerobot(tmp_path / "on", **{switch: True}), tmp_path / "refused")
+    assert not (tmp_path / "refused").exists()
 
 
 def test_what_belongs_to_the_source_alone_does_not_carry_over(tmp_path, caplog):

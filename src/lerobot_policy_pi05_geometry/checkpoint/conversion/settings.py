@@ -21,6 +21,9 @@ _NOT_CARRIED = {
     "type", "device", "use_amp", "repo_id", "private", "tags", "pretrained_path", "pretrained_revision", "use_peft",
     "compile_model", "compile_mode",
 }  # fmt: skip
+# LeRobot 0.6.2's memory of earlier observations (MEM, arXiv 2603.03596): sizes that say nothing while it is off.
+_MEMORY_SWITCHES = ("use_visual_memory", "use_proprioceptive_memory")
+_MEMORY = {*_MEMORY_SWITCHES, "memory_frames", "memory_stride", "memory_temporal_attention_every"}
 # What openpi's converter writes, and our names of it.
 _OPENPI = {
     "action_horizon": "chunk_size",
@@ -35,8 +38,13 @@ def from_lerobot(source: Mapping[str, Any], path: object) -> dict[str, Any]:
         raise ValueError(
             f"{path} is of a PEFT run, which saves adapters and not a policy; merge them into their base checkpoint first."
         )
+    if any(source.get(switch) for switch in _MEMORY_SWITCHES):
+        raise ValueError(
+            f"{path} remembers earlier observations ({' or '.join(_MEMORY_SWITCHES)}), which this policy does not; convert a "
+            "π0.5 without memory."
+        )
     known = {field.name for field in fields(PI05GeometryConfig)}
-    lost = sorted(set(source) - known - _NOT_CARRIED)
+    lost = sorted(set(source) - known - _NOT_CARRIED - _MEMORY)
     if lost:
         logger.warning("%s has settings that this policy does not have, left out: %s.", path, ", ".join(lost))
     settings = {name: value for name, value in source.items() if name in known - _NOT_CARRIED}
