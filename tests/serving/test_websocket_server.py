@@ -223,7 +223,7 @@ def test_a_frame_that_is_too_large_is_refused_by_its_header(running):
 
 
 def test_half_a_frame_and_silence_end_their_own_session_only():
-    with serving(fake_server(FakeEngine()), keepalive=0.3) as running:
+    with serving(fake_server(FakeEngine()), keepalive=1.0) as running:
         good = PolicyClient(running.url)
         raw = socket.create_connection(("127.0.0.1", running.port))
         raw.sendall(
@@ -232,8 +232,8 @@ def test_half_a_frame_and_silence_end_their_own_session_only():
         )
         assert b"101" in raw.recv(4096)
         raw.sendall(b"\x82\xff" + (MIB).to_bytes(8, "big") + b"\0\0\0\0" + b"x" * 1000)  # half, and then nothing
-        raw.settimeout(5)
-        end = time.monotonic() + 5
+        raw.settimeout(30)
+        end = time.monotonic() + 30
         while raw.recv(65536):  # metadata, pings, and the end: nobody answers the pings
             assert good.infer(mine(5))["actions"][0, 0] == 5
             assert time.monotonic() < end
@@ -241,11 +241,11 @@ def test_half_a_frame_and_silence_end_their_own_session_only():
         good.close()
 
 
-@pytest.mark.parametrize("seconds", [1.5, pytest.param(45.0, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seconds", [3.5, pytest.param(45.0, marks=pytest.mark.long)])
 def test_a_long_inference_loses_no_client(engine, seconds):
-    """Scaled down: five keepalives long. In full: 45 s with the keepalive of 20 s, where openpi's own server loses its client."""
+    """Scaled down: three keepalives long. In full: 45 s with the keepalive of 20 s, where openpi's own server loses its client."""
     engine.delay = seconds
-    with serving(fake_server(engine), keepalive=seconds / 5 if seconds < 10 else 20.0) as running:
+    with serving(fake_server(engine), keepalive=1.0 if seconds < 10 else 20.0) as running:
         clients = [PolicyClient(running.url, timeout=4 * seconds) for _ in range(3)]
         for i, client in enumerate(clients):
             client.send(mine(i))
