@@ -243,7 +243,7 @@ def test_half_a_frame_and_silence_end_their_own_session_only():
 
 @pytest.mark.parametrize("seconds", [3.5, pytest.param(45.0, marks=pytest.mark.long)])
 def test_a_long_inference_loses_no_client(engine, seconds):
-    """Scaled down: three keepalives long. In full: 45 s with the keepalive of 20 s, where openpi's own server loses its client."""
+    """Scaled down: three keepalives long. In full: 45 s, keepalive 20 s, where openpi's own server loses its client."""
     engine.delay = seconds
     with serving(fake_server(engine), keepalive=1.0 if seconds < 10 else 20.0) as running:
         clients = [PolicyClient(running.url, timeout=4 * seconds) for _ in range(3)]
