@@ -260,7 +260,6 @@ def test_an_unknown_choice_is_refused_with_those_there_are(name, value, known):
         ({"geometry_dropout": 0.5, "image_dropout": 0.4, "camera_dropout": 0.2}, "must not exceed 1 together"),
         ({"geometry_gate_openness": -0.1}, "geometry_gate_openness must be 0 or more, got -0.1"),
         ({"geometry_gate_openness": float("nan")}, "geometry_gate_openness"),
-        ({"geometry_gate_init": -16.0}, "is of an earlier version, .* write a new one with `pi05-geometry convert"),
         ({"max_depth": 0.02}, "max_depth must be above 0.02 m, got 0.02"),
         ({"max_depth": float("nan")}, "max_depth"),
         ({"flow_samples": 0}, "flow_samples must be at least 1"),

@@ -63,3 +63,4 @@ def refuse_log_gate(config: "PI05GeometryConfig") -> None:
             "new one with `pi05-geometry convert CHECKPOINT OUTPUT` and train that by --policy.path, since the state of its "
             "optimiser does not carry over."
         )
+    config.geometry_gate_init = None

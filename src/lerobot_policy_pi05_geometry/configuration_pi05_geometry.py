@@ -10,7 +10,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from .configuration_checks import check_choices, check_dropout, check_numbers, refuse_log_gate
+from .configuration_checks import check_choices, check_dropout, check_numbers
 from .data.prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
 from .geometry.camera import CameraCalibration
 from .geometry.depth import METRES_PER_UNIT
@@ -95,7 +95,9 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     geometry_gate_openness: float = (
         1.0  # of the gate at the start: 1 open, 1e-7 shut (what `pi05-geometry convert` writes)
     )
-    geometry_gate_init: float | None = None  # a log-gate, in checkpoints of earlier versions: refused
+    geometry_gate_init: float | None = (
+        None  # a log-gate, in checkpoints of earlier versions: no policy is built from one
+    )
     # Probabilities that a training sample goes without a modality: all its geometry masked, all its images, or one camera (its
     # image and its geometry). One draw decides, so a sample never loses more than one, nor the last thing it sees by.
     geometry_dropout: float = 0.2
@@ -112,7 +114,7 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     calibration: dict[str, CameraCalibration] = field(default_factory=dict)
     calibration_given: bool = False  # whether it was given as a file, and so holds over a dataset's own
     geometry_features: dict[str, PolicyFeature] = field(default_factory=dict)  # depth and poses, by validate_features
-    # Depth cameras that a converted checkpoint has embeddings for, before any data has named them; then 0.
+    # Geometry cameras that a converted checkpoint has embeddings for, before any data has named them; then 0.
     geometry_pending: int = 0
 
     # Depth Anything 3, for geometry_source=da3 and features (docs/geometry-from-rgb.md)
@@ -190,8 +192,6 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
         check_choices(self, _CHOICES)
         if self.geometry_source == "da3" and self.da3_encoder is None:
             self.da3_encoder = DEFAULT_ENCODER
-        refuse_log_gate(self)
-        self.geometry_gate_init = None
         check_numbers(self)
         check_dropout(self)
         self.network()  # names variants that do not belong together
@@ -295,7 +295,8 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     def rgb_cameras(self) -> dict[str, str]:
         """RGB cameras that geometry is computed from, in token order, and the key of their images."""
         keys = [key for key in self.image_features if not key.startswith(EMPTY_CAMERA)]
-        return select_cameras({camera_of(key): key for key in sorted(keys)}, self.geometry_cameras, "RGB images")
+        wanted = None if self.geometry_pending and not keys else self.geometry_cameras
+        return select_cameras({camera_of(key): key for key in sorted(keys)}, wanted, "RGB images")
 
     def optional_rgb_cameras(self) -> set[str]:
         """Those of `rgb_cameras` that observations may lack."""

@@ -26,6 +26,7 @@ from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor, nn
 
+from .configuration_checks import refuse_log_gate
 from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
 from .data.images import prepare_images
 from .data.prompt import SMALL_TOKENIZER, small_number_ids
@@ -89,6 +90,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         without a dataset); None: it is loaded here.
         """
         super().__init__(config)
+        refuse_log_gate(config)
         config.validate_features()
         if dataset_stats:
             check_stats(config, dataset_stats)
@@ -108,6 +110,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self._last_update: dict[str, Tensor] = {}
         self._last_share: Tensor | None = None
         if not self.model.action_in_proj.weight.is_meta:  # from_pretrained fills the weights first
+            self._warn_of_random_weights()
             self.to(config.device)
         self.reset()
 
@@ -123,6 +126,15 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if all(key.startswith(EMPTY_CAMERA) for key in self.config.image_features):
             network.paligemma.model.vision_tower.requires_grad_(False)
             network.paligemma.model.multi_modal_projector.requires_grad_(False)
+
+    def _warn_of_random_weights(self) -> None:
+        if self.config.paligemma_variant == "gemma_2b":
+            logger.warning(
+                "THIS POLICY STARTS FROM RANDOM WEIGHTS: its paligemma_variant=gemma_2b has 2.9 billion parameters and no "
+                "pretraining, and will not learn from a robot's dataset. Convert a π0.5 (`pi05-geometry convert "
+                "lerobot/pi05_base OUTPUT`) and train it by --policy.path=OUTPUT; or use the small size, which can be trained "
+                "from scratch (--policy.paligemma_variant=small --policy.action_expert_variant=small)."
+            )
 
     @classmethod
     def from_pretrained(

@@ -68,19 +68,33 @@ def bench(
 
 @app.command()
 def convert(
-    source: Annotated[str, typer.Argument(help="π0.5 checkpoint of LeRobot or openpi (PyTorch): folder or hub id.")],
+    source: Annotated[
+        str,
+        typer.Argument(help="π0.5 checkpoint of LeRobot or openpi (PyTorch), or one of this policy: folder or hub id."),
+    ],
     output: Annotated[Path, typer.Argument(help="Folder to write; it must not be there.")],
-    geometry_source: Annotated[str, typer.Option(help="rgbd, random (control) or none.")] = "rgbd",
+    geometry_source: Annotated[
+        str | None,
+        typer.Option(
+            help="rgbd (depth cameras), da3 (RGB cameras), features (da3, precomputed), random (control), none."
+        ),
+    ] = None,
+    da3_encoder: Annotated[
+        str | None,
+        typer.Option(help="Depth Anything 3, for da3 and features: hub id, folder or file. Default: DA3-BASE."),
+    ] = None,
     geometry_cameras: Annotated[
         str | None,
-        typer.Option(help="Depth cameras in token order, as front,wrist. Default: the one that the data has."),
+        typer.Option(
+            help="Cameras in token order, as front,wrist. Default: the source's, or the one that the data has."
+        ),
     ] = None,
-    geometry_grid: Annotated[int, typer.Option(help="Cells per side and camera.")] = 8,
-    geometry_frame: Annotated[str, typer.Option(help="Points in the robot's base frame, or camera.")] = "base",
-    geometry_expert: Annotated[str, typer.Option(help="shared, or own: a copy of the action expert.")] = "shared",
+    geometry_grid: Annotated[int | None, typer.Option(help="Cells per side and camera.")] = None,
+    geometry_frame: Annotated[str | None, typer.Option(help="Points in the robot's base frame, or camera.")] = None,
+    geometry_expert: Annotated[str | None, typer.Option(help="shared, or own: a copy of the action expert.")] = None,
     geometry_gate_openness: Annotated[
-        float, typer.Option(help="Of the gate at the start: 1e-7 is shut, 1 open.")
-    ] = 1e-7,
+        float | None, typer.Option(help="Of the gate at the start: 1e-7 is shut, 1 open.")
+    ] = None,
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration file. Default: the training data's meta/calibration.json.")
     ] = None,
@@ -99,7 +113,10 @@ def convert(
     """Start from a π0.5: write a checkpoint of this policy that acts as the source does, ready for --policy.path.
 
     Weights, settings and processor statistics carry over. An openpi checkpoint brings weights only: cameras and
-    statistics then come from the data it is trained on.
+    statistics then come from the data it is trained on. By default: rgbd, 8 cells per side, points in the base frame, the
+    gate shut.
+
+    A checkpoint of this policy gets another geometry: only what is named changes, all else stays as it is.
     """
     from ..checkpoint.conversion import GeometryStart
     from ..checkpoint.conversion import convert as run
@@ -112,6 +129,7 @@ def convert(
         frame=geometry_frame,
         expert=geometry_expert,
         openness=geometry_gate_openness,
+        encoder=da3_encoder,
     )
     run(
         source, output, geometry, features_from_data=features_from_data, chunk_size=chunk_size,

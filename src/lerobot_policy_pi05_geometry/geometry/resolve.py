@@ -15,7 +15,7 @@ from .da3.weights import load_da3
 from .dataset_calibration import read_dataset_calibration
 from .feature_store import FeatureStoreSource
 from .feature_store.match import open_store
-from .keys import extrinsics_key
+from .keys import camera_of, extrinsics_key
 from .random_tokens import RandomSource
 from .rgbd import RgbdSource
 from .source import GeometrySource
@@ -43,13 +43,27 @@ def resolve(
     """
     if config.geometry_source == "none":
         return Resolved(None, {})
-    if config.geometry_source == "features" and dataset_meta is not None:
-        return _resolve_store(config, Path(dataset_meta.root))
     if config.geometry_source in ("da3", "features"):
-        source = _da3_source(config, encoder)
-        found = source.encoder.content_hash
-        return Resolved(source, {} if found is None else {"da3_hash": found})
+        return _resolve_from_rgb(config, dataset_meta, encoder)
     return _resolve_depth(config, dataset_meta)
+
+
+def _resolve_from_rgb(config: "PI05GeometryConfig", dataset_meta: Any | None, encoder: Da3Encoder | None) -> Resolved:
+    """Depth Anything 3's features: looked up in a dataset's store, or computed, as in a policy without a dataset."""
+    cameras = list(config.rgb_cameras())
+    changes: dict[str, Any] = {}
+    if config.geometry_pending and cameras:
+        _check_camera_count(config, cameras)
+        changes["geometry_pending"] = 0
+    elif config.geometry_pending and dataset_meta is None:
+        encoder = load_da3(config) if encoder is None else encoder
+        return Resolved(UnknownCameras(_pending(config), config.geometry_grid, encoder.variant.feature_dim), {})
+    if config.geometry_source == "features" and dataset_meta is not None:
+        found = _resolve_store(config, Path(dataset_meta.root))
+        return Resolved(found.source, found.changes | changes)
+    source = _da3_source(config, encoder)
+    content = source.encoder.content_hash
+    return Resolved(source, changes if content is None else changes | {"da3_hash": content})
 
 
 def _resolve_depth(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Resolved:
@@ -59,16 +73,15 @@ def _resolve_depth(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Re
     if config.geometry_pending and sizes:
         _check_camera_count(config, list(sizes))
         changes["geometry_pending"] = 0
-    pending = tuple(config.geometry_cameras or (f"camera{i}" for i in range(config.geometry_pending)))
     if config.geometry_source == "random":
-        cameras = tuple(sizes) or pending or tuple(key.rsplit(".", 1)[-1] for key in config.image_features)
+        cameras = camera_names(config)
         if not cameras:
             raise ValueError(
                 "geometry_source=random makes tokens per camera, but the data has none; use geometry_source=none."
             )
         return Resolved(RandomSource(cameras, config.geometry_grid), changes)
     if not sizes and config.geometry_pending and dataset_meta is None:
-        return Resolved(UnknownCameras(pending, config.geometry_grid), changes)
+        return Resolved(UnknownCameras(_pending(config), config.geometry_grid), changes)
     if not sizes:
         raise ValueError(
             "geometry_source=rgbd needs depth, but the data has no observation.images.<camera>_depth and no feature that "
@@ -94,12 +107,28 @@ def _resolve_depth(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Re
     return Resolved(source, changes)
 
 
+def camera_names(config: "PI05GeometryConfig") -> tuple[str, ...]:
+    """The geometry cameras in token order, as far as the configuration knows them; names in their place while data is awaited."""
+    if config.geometry_source == "none":
+        return ()
+    if config.geometry_source in ("da3", "features"):
+        return tuple(config.rgb_cameras()) or _pending(config)
+    images = tuple(camera_of(key) for key in config.image_features) if config.geometry_source == "random" else ()
+    return tuple(config.depth_cameras()) or _pending(config) or images
+
+
+def _pending(config: "PI05GeometryConfig") -> tuple[str, ...]:
+    """Names of cameras that the data is yet to name."""
+    return tuple(config.geometry_cameras or (f"camera{i}" for i in range(config.geometry_pending)))
+
+
 def _check_camera_count(config: "PI05GeometryConfig", cameras: list[str]) -> None:
-    """Raise ValueError unless the data has as many depth cameras as a converted checkpoint was made for."""
+    """Raise ValueError unless the data has as many cameras as a converted checkpoint was made for."""
     if len(cameras) != config.geometry_pending:
         names = ",".join(cameras)
+        kind = "RGB images" if config.geometry_source in ("da3", "features") else "depth"
         raise ValueError(
-            f"The checkpoint was converted for {config.geometry_pending} depth camera(s), but the data has depth "
+            f"The checkpoint was converted for geometry from {config.geometry_pending} camera(s), but the data has {kind} "
             f"from {len(cameras)}: {names}; convert again with --geometry-cameras {names}, or choose among them with "
             "--policy.geometry_cameras."
         )

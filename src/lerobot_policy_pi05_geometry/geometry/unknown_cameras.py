@@ -1,4 +1,4 @@
-"""Depth cameras that no data has named yet: what a converted checkpoint has until it is trained."""
+"""Cameras of geometry that no data has named yet: what a converted checkpoint has until it is trained."""
 
 import logging
 from collections.abc import Mapping
@@ -14,11 +14,14 @@ logger = logging.getLogger(__name__)
 
 
 class UnknownCameras(GeometrySource):
-    """Places of `RgbdSource` tokens, all of them masked: the policy acts as the π0.5 that it came from."""
+    """Places of tokens, all of them masked: the policy acts as the π0.5 that it came from.
 
-    def __init__(self, cameras: tuple[str, ...], grid: int) -> None:
+    feature_dim: of the source that will take this one's place, by default of `RgbdSource`.
+    """
+
+    def __init__(self, cameras: tuple[str, ...], grid: int, feature_dim: int = FEATURE_DIM) -> None:
         super().__init__()
-        self.cameras, self.grid, self.feature_dim = cameras, grid, FEATURE_DIM
+        self.cameras, self.grid, self.feature_dim = cameras, grid, feature_dim
         self._said = False
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
@@ -27,14 +30,14 @@ class UnknownCameras(GeometrySource):
     def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
         if self.training:
             raise ValueError(
-                "A converted checkpoint learns its depth cameras from a dataset: build it with LeRobot's make_policy and "
+                "A converted checkpoint learns its geometry cameras from a dataset: build it with LeRobot's make_policy and "
                 "the dataset's metadata, as lerobot-train does."
             )
         if not self._said:
             self._said = True
             logger.warning(
-                "No data has named this checkpoint's depth cameras yet, so it acts without geometry, as the π0.5 it was "
-                "converted from; train it with lerobot-train --policy.path on data with depth."
+                "No data has named this checkpoint's geometry cameras yet, so it acts without geometry, as the π0.5 it was "
+                "converted from; train it with lerobot-train --policy.path on data that has them."
             )
         like = batch_like(batch)
         shape = (like.shape[0], len(self.cameras), self.grid**2)

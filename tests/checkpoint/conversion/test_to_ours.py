@@ -218,6 +218,14 @@ def extra(tensors: Tensors) -> None:
     tensors["model.stranger"] = torch.zeros(3)
 
 
+def not_a_number(tensors: Tensors) -> None:
+    tensors[QUERY][3, 5] = float("nan")
+
+
+def infinite(tensors: Tensors) -> Tensors:
+    return {n: t.bfloat16() for n, t in tensors.items()} | {PROJECTION: torch.full((24, 24), -float("inf")).bfloat16()}
+
+
 def twice(tensors: Tensors) -> None:
     tensors["time_mlp_in.weight"] = tensors[PROJECTION].clone()
 
@@ -242,6 +250,8 @@ BAD = [
     (integer, f"has wrong tensors: {PROJECTION} (dtype I32, expected one of"),
     (boolean, f"has wrong tensors: {QUERY} (dtype BOOL, expected one of"),
     (integer_head, f"has wrong tensors: model.{EMBEDDING} (dtype I64, expected one of"),
+    (not_a_number, f"has NaN or infinity in {QUERY}: its training had failed"),
+    (infinite, f"has NaN or infinity in {PROJECTION}"),
     (twice, "has time_mlp_in.weight twice"),
     (as_pi0, "is a π0, not a π0.5"),
     (a_layer_less, "does not have the sizes of paligemma_variant=tiny: its width and number of layers are 32 and 2"),
@@ -282,7 +292,7 @@ def test_a_truncated_file_is_named(kept, tmp_path):
         ({"chunk_size": "many"}, "chunk_size"),
         ({"use_peft": True}, "PEFT"),
         ({"type": "pi0"}, "of type 'pi0', not 'pi05'"),
-        ({"type": "pi05_geometry"}, "converted already"),
+        ({"type": "pi05_geometry"}, "compile_model"),
     ],
 )  # fmt: skip
 def test_settings_that_do_not_fit_are_named(settings, said, tmp_path):

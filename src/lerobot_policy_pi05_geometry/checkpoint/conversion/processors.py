@@ -92,6 +92,12 @@ def processors_to_lerobot(find: FindFile, output: Path) -> None:
     _rewrite(find, POSTPROCESSOR, {}, output)
 
 
+def copy_processors(find: FindFile, output: Path) -> None:
+    """Write the processors of a checkpoint of this policy as they are."""
+    _rewrite(find, PREPROCESSOR, {}, output)
+    _rewrite(find, POSTPROCESSOR, {}, output)
+
+
 def new_processors(config: PI05GeometryConfig, tokenizer: str | None, output: Path) -> None:
     """Write processors without statistics, for a source that has none; training brings its dataset's."""
     for pipeline in make_pi05_geometry_pre_post_processors(replace(deepcopy(config), tokenizer_path=tokenizer)):

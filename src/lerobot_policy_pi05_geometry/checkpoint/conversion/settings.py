@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 LEROBOT_TYPE = "pi05"
 # Belongs to the source's machine, hub account or training run, or is chosen anew.
-_NOT_CARRIED = {
+NOT_CARRIED = {
     "type", "device", "use_amp", "repo_id", "private", "tags", "pretrained_path", "pretrained_revision", "use_peft",
     "compile_model", "compile_mode",
 }  # fmt: skip
@@ -44,10 +44,10 @@ def from_lerobot(source: Mapping[str, Any], path: object) -> dict[str, Any]:
             "π0.5 without memory."
         )
     known = {field.name for field in fields(PI05GeometryConfig)}
-    lost = sorted(set(source) - known - _NOT_CARRIED - _MEMORY)
+    lost = sorted(set(source) - known - NOT_CARRIED - _MEMORY)
     if lost:
         logger.warning("%s has settings that this policy does not have, left out: %s.", path, ", ".join(lost))
-    settings = {name: value for name, value in source.items() if name in known - _NOT_CARRIED}
+    settings = {name: value for name, value in source.items() if name in known - NOT_CARRIED}
     # LeRobot keeps the empty cameras it adds among the inputs; here they are added on the other side of `validate_features`.
     inputs = (settings.get("input_features") or {}).items()
     return settings | {"input_features": {key: value for key, value in inputs if not key.startswith(EMPTY_CAMERA)}}

@@ -15,9 +15,16 @@ from safetensors import SafetensorError, safe_open
 
 from ...weight_files.strict_load import complain
 
-_CHUNK = 1 << 24  # bytes copied at a time
+_CHUNK = 1 << 22  # numbers copied at a time
 _BYTES = {"F64": 8, "F32": 4, "F16": 2, "BF16": 2, "I64": 8}
-_DTYPES = {torch.float32: "F32", torch.bfloat16: "BF16", torch.int64: "I64"}
+_TORCH = {
+    "F64": torch.float64,
+    "F32": torch.float32,
+    "F16": torch.float16,
+    "BF16": torch.bfloat16,
+    "I64": torch.int64,
+}
+_DTYPES = {dtype: name for name, dtype in _TORCH.items()}
 
 _FLOATS = ("F64", "F32", "F16", "BF16")
 
@@ -57,6 +64,15 @@ def read_tensors(path: Path) -> dict[str, StoredTensor]:
     }
 
 
+def read_tensor(stored: StoredTensor) -> torch.Tensor:
+    """A small tensor, into memory. Raises ValueError if it is cut off."""
+    size = _size(stored)
+    with stored.path.open("rb") as file:
+        file.seek(stored.start)
+        content = bytearray(file.read(size))
+    return torch.frombuffer(content, dtype=_TORCH[stored.dtype]).view(stored.shape)
+
+
 def check_weights(path: Path, expected: Mapping[str, tuple[int, ...]], found: Mapping[str, StoredTensor]) -> None:
     """Raise ValueError unless these are the expected names in the expected shapes, all of floating-point dtype."""
     left = "nothing was written"
@@ -72,7 +88,10 @@ def check_weights(path: Path, expected: Mapping[str, tuple[int, ...]], found: Ma
 
 
 def write_tensors(path: Path, tensors: Mapping[str, StoredTensor | Zeros | torch.Tensor]) -> None:
-    """Write a safetensors file. Widest dtypes come first, as the format wants it for alignment."""
+    """Write a safetensors file. Widest dtypes come first, as the format wants it for alignment.
+
+    Raises ValueError for a tensor that holds NaN or infinity.
+    """
     sizes = {name: _size(tensor) for name, tensor in tensors.items()}
     order = sorted(tensors, key=lambda name: (-_BYTES[_dtype(tensors[name])], name))
     header: dict[str, object] = {"__metadata__": {"format": "pt"}}
@@ -86,7 +105,7 @@ def write_tensors(path: Path, tensors: Mapping[str, StoredTensor | Zeros | torch
     with path.open("xb") as file:
         file.write(len(encoded).to_bytes(8, "little") + encoded)
         for name in order:
-            _write(file, tensors[name], sizes[name])
+            _write(file, name, tensors[name], sizes[name])
 
 
 def total_size(tensors: Mapping[str, StoredTensor | Zeros | torch.Tensor]) -> int:
@@ -102,14 +121,23 @@ def _size(tensor: StoredTensor | Zeros | torch.Tensor) -> int:
     return torch.Size(tensor.shape).numel() * _BYTES[_dtype(tensor)]
 
 
-def _write(file: BinaryIO, tensor: StoredTensor | Zeros | torch.Tensor, size: int) -> None:
+def _write(file: BinaryIO, name: str, tensor: StoredTensor | Zeros | torch.Tensor, size: int) -> None:
     if isinstance(tensor, torch.Tensor):
         file.write(tensor.detach().contiguous().flatten().view(torch.uint8).numpy().tobytes())
-    elif isinstance(tensor, Zeros):
-        for begin in range(0, size, _CHUNK):
-            file.write(bytes(min(_CHUNK, size - begin)))
-    else:
-        with tensor.path.open("rb") as source:
-            source.seek(tensor.start)
-            for begin in range(0, size, _CHUNK):
-                file.write(source.read(min(_CHUNK, size - begin)))
+        return
+    step = _CHUNK * _BYTES[tensor.dtype]
+    lengths = [min(step, size - begin) for begin in range(0, size, step)]
+    if isinstance(tensor, Zeros):
+        for length in lengths:
+            file.write(bytes(length))
+        return
+    with tensor.path.open("rb") as source:
+        source.seek(tensor.start)
+        for length in lengths:
+            content = bytearray(source.read(length))
+            if not torch.frombuffer(content, dtype=_TORCH[tensor.dtype]).isfinite().all():
+                raise ValueError(
+                    f"Checkpoint {tensor.path} has NaN or infinity in {name}: its training had failed before it was saved; "
+                    "choose an earlier one. Nothing was written."
+                )
+            file.write(content)

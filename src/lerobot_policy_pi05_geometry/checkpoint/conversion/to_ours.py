@@ -4,65 +4,29 @@ import json
 import logging
 import math
 from collections.abc import Mapping
-from copy import deepcopy
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from accelerate import init_empty_weights
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
+from torch import Tensor
 
 from ...configuration_pi05_geometry import PI05GeometryConfig
-from ...geometry import read_calibration_file
 from ...model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 from ...modeling_pi05_geometry import PI05GeometryPolicy
 from ...weight_files.files import CONFIG_FILE, find_file, find_optional_file, new_folder
+from ..merge import ADAPTER_CONFIG
+from .geometry_start import GeometryStart, has_images
 from .names import PREFIX, find_parameters
-from .processors import POSTPROCESSOR, PREPROCESSOR, new_processors, processors_from_lerobot
+from .other_geometry import other_geometry
+from .processors import POSTPROCESSOR, PREPROCESSOR, copy_processors, new_processors, processors_from_lerobot
 from .settings import LEROBOT_TYPE, from_lerobot, from_openpi, make_config, save_config
-from .start import inherited_shapes, start_values
+from .start import inherited_shapes, meta_policy, start_values
 from .tensor_file import StoredTensor, check_weights, read_tensors, total_size, write_tensors
 
 logger = logging.getLogger(__name__)
 
-# Logits on keys that the network has never seen may be well above those on the ones it has: with random weights and an openness
-# of 3e-4, actions moved by up to 0.1, at 6e-6 by 3e-3, at 1e-7 by 5e-5 (docs/results.md). Invariant 9 allows 1e-3.
-SHUT = 1e-7
-# A policy that acts from RGB takes geometry up only if the gate moves fast and images are missing often enough: neither alone
-# did (docs/results.md, "Warm start").
-TAKE_UP = {"geometry_lr": 3e-3, "geometry_gate_lr": 5e-2, "image_dropout": 0.4, "geometry_dropout": 0.2}
-
-
-@dataclass(frozen=True)
-class GeometryStart:
-    """The geometry that a converted checkpoint starts with.
-
-    source: rgbd, random or none. cameras: names of the depth cameras in token order; None for one camera whose name the
-    training data tells. calibration: a calibration file, or None if the training data has it. openness: of the gate, see `SHUT`.
-    expert: shared, or own, a copy of the action expert. frame, grid: as in the configuration.
-    """
-
-    source: str = "rgbd"
-    cameras: tuple[str, ...] | None = None
-    calibration: Path | None = None
-    grid: int = 8
-    frame: str = "base"
-    expert: str = "shared"
-    openness: float = SHUT
-
-    def settings(self) -> dict[str, Any]:
-        """Fields of the configuration. Parallel positions leave the actions where π0.5 has them."""
-        return {
-            "geometry_source": self.source,
-            "geometry_cameras": None if self.cameras is None else list(self.cameras),
-            "geometry_pending": 0 if self.source == "none" else len(self.cameras or [""]),
-            "geometry_grid": self.grid,
-            "geometry_frame": self.frame,
-            "geometry_expert": self.expert,
-            "geometry_gate_openness": self.openness,
-            **TAKE_UP,
-            "geometry_positions": "parallel",
-        }
+# Its dtype is the one that a network's matrices are stored in.
+_A_MATRIX = "paligemma_with_expert.gemma_expert.model.layers.0.self_attn.q_proj.weight"
 
 
 def convert(
@@ -78,10 +42,10 @@ def convert(
 ) -> PI05GeometryConfig:
     """Write `output`, a folder that is not there yet; returns its configuration.
 
-    source: folder or hub id of a π0.5 checkpoint of LeRobot or openpi (PyTorch). features_from_data: leave cameras
-    and state to the training data, instead of the source's. chunk_size: actions per chunk, for an openpi checkpoint that
-    does not say. tokenizer: folder or hub id, None for the source's. seed: draws the adapter. hub: arguments of
-    `hf_hub_download`, such as `revision`.
+    source: folder or hub id of a π0.5 checkpoint of LeRobot or openpi (PyTorch), or of a checkpoint of this policy that is to
+    get another geometry. features_from_data: leave cameras and state to the training data, instead of the source's.
+    chunk_size: actions per chunk, for an openpi checkpoint that does not say. tokenizer: folder or hub id, None for the source's.
+    seed: draws the adapter. hub: arguments of `hf_hub_download`, such as `revision`.
 
     Raises ValueError, FileNotFoundError, FileExistsError or OSError, with one sentence; then nothing is left behind.
     """
@@ -89,53 +53,82 @@ def convert(
     def find(name: str) -> Path:
         return find_file(source, name, **hub)
 
-    file = find(SAFETENSORS_SINGLE_FILE)
+    start = geometry or GeometryStart()
     described = find_optional_file(source, CONFIG_FILE, **hub)
     described_by = _read_json(described) if described is not None else {}
     kind = described_by.get("type")
-    if kind is not None and kind != LEROBOT_TYPE:
-        done = " It is converted already." if kind == PI05GeometryPolicy.name else ""
+    if kind not in (None, LEROBOT_TYPE, PI05GeometryPolicy.name):
         raise ValueError(
-            f"{source} is a checkpoint of type '{kind}', not '{LEROBOT_TYPE}': only π0.5 checkpoints of LeRobot and openpi "
-            f"can be converted.{done}"
+            f"{source} is a checkpoint of type '{kind}', not '{LEROBOT_TYPE}': only π0.5 checkpoints of LeRobot and openpi, "
+            "and those of this policy, can be converted."
         )
+    ours = kind == PI05GeometryPolicy.name
+    if ours and find_optional_file(source, ADAPTER_CONFIG, **hub) is not None:
+        raise ValueError(f"{source} was trained with LoRA; merge it first (`pi05-geometry merge {source} MERGED`).")
+    file = find(SAFETENSORS_SINGLE_FILE)
     stored = read_tensors(file)
-    parameters = {name: stored[theirs] for name, theirs in find_parameters(file, stored).items()}
-    if kind is None:
-        carried = from_openpi(described_by, chunk_size, source) | _sizes_of(parameters)
+    if ours:
+        config, tensors = other_geometry(source, described_by, file, stored, start, features_from_data, seed)
     else:
-        carried = from_lerobot(described_by, described)
-    if features_from_data:
-        carried |= {"input_features": {}, "output_features": {}}
-    config = _configure(carried, geometry or GeometryStart(), source)
-    with init_empty_weights(include_buffers=False):
-        policy = PI05GeometryPolicy(deepcopy(config))  # a policy completes its configuration
-    theirs = {PREFIX + name: tensor for name, tensor in parameters.items()}
-    _check_variants(file, config, theirs)
-    check_weights(file, inherited_shapes(policy), theirs)
-    tensors = theirs | start_values(policy, theirs, seed)
-    assert set(tensors) == set(policy.state_dict())
+        parameters = {name: stored[theirs] for name, theirs in find_parameters(file, stored).items()}
+        if kind is None:
+            carried = from_openpi(described_by, chunk_size, source) | _sizes_of(parameters)
+        else:
+            carried = from_lerobot(described_by, described)
+        if features_from_data:
+            carried |= {"input_features": {}, "output_features": {}}
+        config, tensors = _with_geometry(
+            source, carried | _dtypes(parameters, carried, source), file, parameters, start, seed
+        )
 
     with new_folder(output, total_size(tensors)) as folder:
-        if kind is not None and find_optional_file(source, PREPROCESSOR, **hub) is not None:
-            processors_from_lerobot(find, config, tokenizer, folder)
-        else:
+        if kind is None or find_optional_file(source, PREPROCESSOR, **hub) is None:
             logger.warning(
                 "%s has no %s: processors are made anew and have no statistics; training brings its dataset's.",
                 source, f"{PREPROCESSOR} and {POSTPROCESSOR}" if kind else "settings and processors of LeRobot's",
             )  # fmt: skip
             new_processors(config, tokenizer, folder)
+        elif kind == LEROBOT_TYPE:
+            processors_from_lerobot(find, config, tokenizer, folder)
+        else:
+            copy_processors(find, folder)
         save_config(config, folder)
         write_tensors(folder / SAFETENSORS_SINGLE_FILE, tensors)
     return config
 
 
-def _configure(carried: Mapping[str, Any], geometry: GeometryStart, source: object) -> PI05GeometryConfig:
-    config = make_config({**carried, **geometry.settings()}, source)
-    if geometry.calibration is not None:
-        config.calibration = read_calibration_file(geometry.calibration)
-        config.calibration_given = True
-    return config
+def _with_geometry(
+    source: object,
+    carried: Mapping[str, Any],
+    file: Path,
+    parameters: Mapping[str, StoredTensor],
+    start: GeometryStart,
+    seed: int,
+) -> tuple[PI05GeometryConfig, dict[str, StoredTensor | Tensor]]:
+    """Configuration and tensors of a π0.5 with geometry. parameters: by the network's names, all that there are."""
+    config = make_config({**carried, **start.settings(has_images(carried))}, source)
+    start.calibrate(config)
+    policy = meta_policy(config)
+    theirs = {PREFIX + name: tensor for name, tensor in parameters.items()}
+    _check_variants(file, config, theirs)
+    check_weights(file, inherited_shapes(policy), theirs)
+    tensors = theirs | start_values(policy, theirs, seed)
+    assert set(tensors) == set(policy.state_dict())
+    return config, tensors
+
+
+def _dtypes(parameters: Mapping[str, StoredTensor], carried: Mapping[str, Any], source: object) -> dict[str, Any]:
+    """Weights that are stored in bfloat16 stay so in memory, where the source computes in bfloat16 or does not say."""
+    matrix = parameters.get(_A_MATRIX)
+    if matrix is None or matrix.dtype != "BF16":
+        return {}
+    if carried.get("dtype", "bfloat16") == "bfloat16":
+        return {"dtype": "bfloat16", "param_dtype": "bfloat16"}
+    logger.warning(
+        "%s stores its weights in bfloat16 and computes in %s (its setting dtype), so they take twice the memory once loaded; "
+        "--policy.dtype=bfloat16 --policy.param_dtype=bfloat16 keeps them as they are.", source, carried["dtype"],
+    )  # fmt: skip
+    return {}
 
 
 def _sizes_of(parameters: Mapping[str, StoredTensor]) -> dict[str, Any]:

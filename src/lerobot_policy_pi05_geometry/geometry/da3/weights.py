@@ -33,6 +33,18 @@ def load_da3(config: "PI05GeometryConfig") -> Da3Encoder:
     Do not call it where parameters are created on the meta device: its weights are read at once.
     Raises FileNotFoundError or ValueError, with one sentence, for an encoder that is not found, is damaged, or is another.
     """
+    path, encoder = _identify(config)
+    load_strictly(encoder.backbone, path, BACKBONE_PREFIX, OTHER_PREFIXES)
+    return encoder
+
+
+def meta_da3(config: "PI05GeometryConfig") -> Da3Encoder:
+    """The same without its weights, for its sizes and its hash."""
+    return _identify(config)[1]
+
+
+def _identify(config: "PI05GeometryConfig") -> tuple[Path, Da3Encoder]:
+    """File and architecture of the configuration's encoder, with parameters on the meta device."""
     name = config.da3_encoder
     if name is None:
         raise ValueError("This policy names no Depth Anything 3 encoder; say which by --policy.da3_encoder.")
@@ -46,12 +58,12 @@ def load_da3(config: "PI05GeometryConfig") -> Da3Encoder:
             f"{config.da3_hash} of the backbone, {path} has {found}; give the one it was trained with by "
             "--policy.da3_encoder."
         )
+    config.da3_hash = found
     dtype = DTYPES[config.da3_dtype]
     with torch.device("meta"):
         backbone = Da3Backbone(variant)
     store_products_in(backbone, dtype)
-    load_strictly(backbone, path, BACKBONE_PREFIX, OTHER_PREFIXES)
-    return Da3Encoder(backbone, dtype, found)
+    return path, Da3Encoder(backbone, dtype, found)
 
 
 def read_variant(path: Path) -> Da3Variant:
@@ -85,7 +97,7 @@ def find_encoder(encoder: str) -> Path:
     except FileNotFoundError as error:
         raise FileNotFoundError(
             f"The Depth Anything 3 encoder is not found: {str(error).removesuffix('.')}; give a hub id, a folder or a "
-            "safetensors file by --policy.da3_encoder (a checkpoint holds none of the encoder's weights)."
+            "safetensors file by --policy.da3_encoder (convert: --da3-encoder; a checkpoint holds none of the encoder's weights)."
         ) from error
 
 
