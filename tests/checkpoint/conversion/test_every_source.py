@@ -149,8 +149,7 @@ def test_the_data_names_the_cameras_that_depth_anything_looks_through(
     [
         (GeometryStart("depth"), "--geometry-source must be one of rgbd, da3, features, random, none, got 'depth'"),
         (GeometryStart("rgbd", encoder="somewhere"), "--da3-encoder belongs to --geometry-source=da3 or features"),
-        (GeometryStart("da3", encoder="/nowhere"), "The Depth Anything 3 encoder cannot be had"),
-        (GeometryStart("none", cameras=("front",)), "--geometry-cameras has no meaning"),
+        (GeometryStart("da3", encoder="/nowhere"), "The Depth Anything 3 encoder is not found"),
         (GeometryStart("random", calibration=Path("x")), "--calibration has no meaning"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -55,11 +55,11 @@ def test_before_any_data_it_acts_as_its_source(source, lerobot_source, tmp_path,
     convert(lerobot_source, tmp_path / "output", GeometryStart(source=source))
     policy = PI05GeometryPolicy.from_pretrained(tmp_path / "output")
     assert distance(policy, make_batch(2)) < (1e-3 if source == "random" else 1e-5)
-    assert caplog.text.count("No data has named this checkpoint's depth cameras yet") == (source == "rgbd")
+    assert caplog.text.count("No data has named this checkpoint's geometry cameras yet") == (source == "rgbd")
     distance(policy, make_batch(2))
     assert caplog.text.count("No data has named") == (source == "rgbd")
     if source == "rgbd":
-        with pytest.raises(ValueError, match="learns its depth cameras from a dataset"):
+        with pytest.raises(ValueError, match="learns its geometry cameras from a dataset"):
             policy.train().forward(make_batch(2))
 
 
@@ -109,7 +109,7 @@ def test_one_camera_is_whichever_the_data_has(lerobot_source, tmp_path):
 @pytest.mark.parametrize(
     ("cameras", "data", "said"),
     [
-        (None, ("a", "b"), "1 depth camera(s), but the data has depth from 2: a,b; convert again with --geometry-cameras a,b"),
+        (None, ("a", "b"), "from 1 camera(s), but the data has depth from 2: a,b; convert again with --geometry-cameras a,b"),
         (("a", "c"), ("a", "b"), "geometry_cameras names c, but the data has depth from a, b only"),
     ],
 )  # fmt: skip

@@ -46,8 +46,6 @@ class GeometryStart:
             )
         if self.calibration is not None and source in ("random", "none"):
             raise ValueError(f"--calibration has no meaning with --geometry-source={source}; leave it out.")
-        if self.cameras is not None and source == "none":
-            raise ValueError("--geometry-cameras has no meaning with --geometry-source=none; leave it out.")
 
     def settings(self, has_images: bool) -> dict[str, Any]:
         """Fields of the configuration of a π0.5 that gets this geometry. has_images: whether its cameras are known.

@@ -58,7 +58,6 @@ def _identify(config: "PI05GeometryConfig") -> tuple[Path, Da3Encoder]:
             f"{config.da3_hash} of the backbone, {path} has {found}; give the one it was trained with by "
             "--policy.da3_encoder."
         )
-    config.da3_hash = found
     dtype = DTYPES[config.da3_dtype]
     with torch.device("meta"):
         backbone = Da3Backbone(variant)
