@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from lerobot_policy_pi05_geometry.model.attention import _fold, _logit_bias, attention_weights
+from lerobot_policy_pi05_geometry.model.attention import attention_weights, fold_heads, logit_bias
 
 # name: batch, heads, queries, keys, head_dim, dtype
 CASES = {
@@ -28,12 +28,12 @@ CASES = {
 
 
 def written_out(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
-    return torch.matmul(_fold(attention_weights(q, k, mask), v), v).view_as(q)
+    return torch.matmul(fold_heads(attention_weights(q, k, mask), v.shape[1]), v).view_as(q)
 
 
 def sdpa(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
     k, v = (x.expand(-1, q.shape[1], -1, -1) for x in (k, v))
-    return F.scaled_dot_product_attention(q, k, v, attn_mask=_logit_bias(mask, None, q.dtype))
+    return F.scaled_dot_product_attention(q, k, v, attn_mask=logit_bias(mask, None, q.dtype))
 
 
 def seconds(function: Callable[[], Tensor], backward: bool, repeat: int, device: str) -> float:

@@ -36,7 +36,7 @@ from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS, Da3Backbone, Da3
 from lerobot_policy_pi05_geometry.geometry.da3.encoder import store_products_in
 from lerobot_policy_pi05_geometry.inference.cuda_graphs import GraphRunner
 from lerobot_policy_pi05_geometry.inference.layers import run_layers
-from lerobot_policy_pi05_geometry.inference.runner import Chunk, ChunkRunner, Observation
+from lerobot_policy_pi05_geometry.inference.runner import ChunkFunctions, ChunkRunner, ChunkSettings, Observation
 from lerobot_policy_pi05_geometry.inference.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.inference.side_stream import PendingGeometry
 from lerobot_policy_pi05_geometry.model import PI05Pytorch
@@ -54,32 +54,27 @@ PAIRS = {
 class CompiledWhole(ChunkRunner):
     """A runner whose whole chunk is one compiled function. Policies do not have it: on a CPU it gains little and takes long."""
 
-    def _build(self) -> None:
-        super()._build()
+    def __init__(self, network: PI05Pytorch) -> None:
+        super().__init__(network)
         self._whole = torch.compile(self._both, dynamic=False, options={"max_autotune": True, "cpp_wrapper": True})
 
-    def _both(self, observation, early, noise, late, room, num_steps):
-        return self.act(self.look(observation, early, room), noise, late, num_steps)
+    def _both(self, observation, early, noise, late, previous, settings):
+        return self.denoise(self.prefill(observation, early, settings), noise, late, previous, settings)
 
-    def _chunk(self, observation, noise, num_steps, num_tokens):
-        room = (0 if self.network.geometry_in_prefix else num_tokens, noise.shape[1])
-        return Chunk(lambda *seen: seen, lambda seen, noise, late: self._whole(*seen, noise, late, room, num_steps))
-
-    @property
-    def _may_look(self) -> bool:
-        return False
+    def _functions(self, observation, noise, previous, settings):
+        return ChunkFunctions(lambda *seen: seen, lambda seen, *inputs: self._whole(*seen, *inputs, settings))
 
 
 class CompiledGraphs(GraphRunner):
     """A runner with compiled layers, recorded."""
 
-    def _build(self) -> None:
-        super()._build()
+    def __init__(self, network: PI05Pytorch) -> None:
+        super().__init__(network)
         self._compiled = torch.compile(run_layers, dynamic=False, fullgraph=True)
 
-    def _run(self, segment, embs, frame, cache, modulations, output):
+    def _run(self, segment, embs, frame, cache, flow_time, output):
         x, layers = embs.to(self.config.dtype), self._layers[segment]
-        return self._compiled(x, layers, self.config.expert, frame, cache, cache.span(segment), modulations, output)
+        return self._compiled(x, layers, self.config.expert, frame, cache, cache.span(segment), flow_time, output)
 
 
 def synchronise(device: str) -> None:
@@ -185,14 +180,16 @@ def split(args: argparse.Namespace, cameras: int, ours: PI05Pytorch, lerobot) ->
 
     steps = ours.config.num_inference_steps
     on_cpu = args.device == "cpu"
-    settings = argparse.Namespace(**{**vars(args), "cameras": cameras})
-    theirs = lerobot_parts(EAGER, lerobot, settings)["denoise step"] if on_cpu else None
+    lengths = (args.geometry_tokens, noise.shape[1])
+    settings = ChunkSettings(args.geometry_tokens, lengths, steps, 0.0)
+    with_cameras = argparse.Namespace(**{**vars(args), "cameras": cameras})
+    theirs = lerobot_parts(EAGER, lerobot, with_cameras)["denoise step"] if on_cpu else None
     ratios = []
     for _ in range(args.rounds + 1):
-        prefix = timed("vision and text", partial(runner.embed, observation))
-        context = timed("prefix", partial(runner.prefill, prefix, (args.geometry_tokens, noise.shape[1])))
-        pad = timed("geometry", partial(runner.prefill_geometry, context, geometry))
-        timed("denoising", partial(runner.denoise, context, noise, pad, steps))
+        prefix = timed("vision and text", partial(runner.embed_prefix, observation))
+        context = timed("prefix", partial(runner.prefill_prefix, prefix, settings.lengths))
+        segment = timed("geometry", partial(runner.prefill_geometry, context, geometry))
+        timed("denoising", partial(runner.denoise_suffix, context, noise, segment, None, settings))
         if theirs is not None:
             ratios.append(
                 times["denoising"][-1] / steps / statistics.mean(seconds(theirs, args.device) for _ in range(3))

@@ -1,9 +1,11 @@
 """Checks of the configuration's values: each raises ValueError with one sentence that names the setting."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
+from .compat import mode_of
 from .geometry.depth import MIN_DEPTH
+from .model.config import RtcMode
 
 if TYPE_CHECKING:
     from .configuration_pi05_geometry import PI05GeometryConfig
@@ -31,6 +33,11 @@ def check_numbers(config: "PI05GeometryConfig") -> None:
         raise ValueError("geometry_cameras is empty; name a camera, or set geometry_source=none.")
     if config.n_action_steps > config.chunk_size:
         raise ValueError(f"n_action_steps ({config.n_action_steps}) must not exceed chunk_size ({config.chunk_size}).")
+    if not 0 <= config.rtc_training_max_delay < config.chunk_size:
+        raise ValueError(
+            f"rtc_training_max_delay must be at least 0 and less than chunk_size ({config.chunk_size}), "
+            f"got {config.rtc_training_max_delay}."
+        )
     if not 0 <= config.geometry_gate_openness < float("inf"):
         raise ValueError(f"geometry_gate_openness must be 0 or more, got {config.geometry_gate_openness}.")
     if not config.max_depth > MIN_DEPTH:
@@ -64,3 +71,19 @@ def refuse_log_gate(config: "PI05GeometryConfig") -> None:
             "optimiser does not carry over."
         )
     config.geometry_gate_init = None
+
+
+def rtc_mode(config: "PI05GeometryConfig") -> RtcMode:
+    """How real-time chunking continues the previous chunk.
+
+    Raises ValueError for an unknown mode, for two different ones, and for trained RTC of a policy without that training.
+    """
+    theirs = mode_of(config.rtc_config)
+    mode = config.rtc_mode or theirs or "guided"
+    if mode not in get_args(RtcMode):
+        raise ValueError(f"--policy.rtc_mode must be one of {', '.join(get_args(RtcMode))}, got {mode!r}.")
+    if theirs not in (None, mode):
+        raise ValueError(f"rtc_mode={mode} contradicts rtc_config.mode={theirs}; set only rtc_config.mode.")
+    if mode == "trained" and not config.rtc_training_max_delay:
+        raise ValueError("rtc_mode=trained needs a policy that was trained with rtc_training_max_delay above 0.")
+    return mode  # type: ignore[return-value]

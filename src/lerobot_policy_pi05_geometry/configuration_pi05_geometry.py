@@ -10,7 +10,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from .configuration_checks import check_choices, check_dropout, check_numbers
+from .configuration_checks import check_choices, check_dropout, check_numbers, rtc_mode
 from .data.prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
 from .geometry.camera import CameraCalibration
 from .geometry.depth import METRES_PER_UNIT
@@ -148,6 +148,11 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     action_feature_names: list[str] | None = None
 
     rtc_config: RTCConfig | None = None
+    # Real-time chunking: guided, or trained (model/real_time_chunking.py). None: rtc_config.mode where LeRobot has it, or guided.
+    rtc_mode: str | None = None
+    rtc_training_max_delay: int = (
+        0  # longest hard prefix of training samples, in action steps; 0: none, so no trained RTC
+    )
     image_resolution: tuple[int, int] = (224, 224)
     empty_cameras: int = 0
     absent_cameras: list[str] = field(default_factory=list)  # RGB keys that observations may lack
@@ -194,6 +199,7 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
             self.da3_encoder = DEFAULT_ENCODER
         check_numbers(self)
         check_dropout(self)
+        rtc_mode(self)
         self.network()  # names variants that do not belong together
 
     def network(self) -> NetworkConfig:
@@ -220,6 +226,7 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
             dtype=DTYPES[self.dtype],
             param_dtype=DTYPES[self.param_dtype],
             geometry=geometry,
+            rtc_training_max_delay=self.rtc_training_max_delay,
         )
 
     def record(self, changes: Mapping[str, Any]) -> None:

@@ -22,16 +22,16 @@ from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.common.vla_utils import pad_vector
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 from torch import Tensor, nn
 
-from .configuration_checks import refuse_log_gate
+from .compat import make_rtc_processor
+from .configuration_checks import refuse_log_gate, rtc_mode
 from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
 from .data.images import prepare_images
 from .data.prompt import SMALL_TOKENIZER, small_number_ids
 from .data.statistics import check_stats
-from .geometry import GeometryEncoder, GeometrySource
+from .geometry import GeometryEncoder
 from .geometry.da3 import Da3Encoder
 from .geometry.da3.weights import load_da3
 from .geometry.keys import camera_of
@@ -58,7 +58,7 @@ _EVALUATION_STEP = -1  # evaluation loss draws the same noise at every training 
 
 
 class TrainingProgress(nn.Module):
-    """Optimiser steps done, kept in the checkpoint: noise is keyed by them (see model/flow.py).
+    """Optimiser steps done, kept in the checkpoint: noise is keyed by them (see model/flow_matching.py).
 
     A module, so that PEFT can save it.
     """
@@ -95,13 +95,14 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if dataset_stats:
             check_stats(config, dataset_stats)
         self.config: PI05GeometryConfig = config
+        self.model = PI05Pytorch(config.network())
         self.init_rtc_processor()
-        self.model = PI05Pytorch(config.network(), self.rtc_processor)
         self.sampler = ChunkSampler(self.model)
-        source = self._build_source(dataset_meta, encoder)
+        source, changes = resolve(config, dataset_meta, encoder)
+        config.record(changes)
         self.geometry = None if source is None else GeometryEncoder(source, self.model.geometry_width)
         if config.tokenizer == SMALL_TOKENIZER and not self.model.action_in_proj.weight.is_meta:
-            self.model.paligemma_with_expert.language_model.start_numbers_in_order(small_number_ids())
+            self.model.paligemma_with_expert.language_model.initialise_number_embeddings(small_number_ids())
         self._set_trainable()
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
@@ -113,11 +114,6 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             self._warn_of_random_weights()
             self.to(config.device)
         self.reset()
-
-    def _build_source(self, dataset_meta: Any | None, encoder: Da3Encoder | None) -> GeometrySource | None:
-        source, changes = resolve(self.config, dataset_meta, encoder)
-        self.config.record(changes)
-        return source
 
     def _set_trainable(self) -> None:
         network = self.model.paligemma_with_expert
@@ -207,6 +203,10 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         draw = self._draw(batch, torch.Size((size, steps, self.config.max_action_dim)))
         is_pad = batch.get("action_is_pad")
         valid = torch.ones(size, steps, dtype=torch.bool, device=device) if is_pad is None else ~is_pad  # (B, S)
+        if self.config.rtc_training_max_delay:  # a hard prefix is no target; one valid step remains
+            delay = torch.minimum(draw.delay.to(device), (valid.sum(dim=1) - 1).clamp_min(0))  # (B,)
+            draw = draw._replace(delay=delay)
+            valid = valid & (torch.arange(steps, device=device) >= delay[:, None])
         action_dim = self.config.action_feature.shape[0]
         seen: list[Tensor] = []
 
@@ -279,6 +279,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             draw.time.to(device),
             embs,
             pad,
+            delay=draw.delay.to(device) if self.config.rtc_training_max_delay else None,
         )
         return losses.mean(dim=1) if losses.ndim == 4 else losses
 
@@ -302,6 +303,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             scale=self.config.time_sampling_scale,
             offset=self.config.time_sampling_offset,
             samples=self.config.flow_samples,
+            max_delay=self.config.rtc_training_max_delay,
         )
 
     def new_parameters(self) -> dict[str, nn.Parameter]:
@@ -392,6 +394,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
 
     def init_rtc_processor(self) -> None:
         """LeRobot calls this after setting `config.rtc_config`."""
-        self.rtc_processor = None if self.config.rtc_config is None else RTCProcessor(self.config.rtc_config)
-        if hasattr(self, "model"):
-            self.model.rtc_processor = self.rtc_processor
+        rtc, mode = self.config.rtc_config, rtc_mode(self.config)
+        trained = self.config.rtc_training_max_delay > 0
+        self.rtc_processor = None if rtc is None else make_rtc_processor(rtc, trained)
+        self.model.rtc_processor, self.model.rtc_mode = self.rtc_processor, mode

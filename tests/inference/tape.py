@@ -1,7 +1,7 @@
-"""What CUDA graphs do, on a CPU: every operation is written down with its tensors, and done again with the same ones.
+"""CUDA graphs imitated on a CPU: every operation is recorded with its tensors, and repeated with the same tensors.
 
-So whatever Python decided while recording stays decided, and whatever is read that is not written again by the work itself
-stays as it was: code that a graph would get wrong is wrong here too. An operation that would make a GPU wait is an error.
+A decision that Python took while recording stays taken, and a tensor that the work reads but does not write keeps its value. So
+code that would be wrong in a graph is wrong here too. An operation that would make the host wait for a GPU is an error.
 """
 
 from collections.abc import Callable
@@ -12,6 +12,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from lerobot_policy_pi05_geometry.inference.backend import Backend
+from lerobot_policy_pi05_geometry.inference.recorder import Recorder
+
 WAITS = {"_local_scalar_dense", "item", "is_nonzero", "equal", "nonzero", "masked_select", "_unique2", "unique_dim"}
 
 
@@ -21,7 +24,7 @@ def storages(tree: Any) -> set[int]:
 
 
 class Tape(TorchDispatchMode):
-    """Writes down what is done while it is on."""
+    """Records the operations while it is active."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -53,8 +56,17 @@ class TapeRecorder:
     def record[T](self, work: Callable[[], T]) -> tuple[T, Callable[[], None]]:
         with Tape() as tape:
             result = work()
-        for *_, new in tape.steps:  # what recording left behind is not what a graph leaves behind
+        for *_, new in tape.steps:  # a graph leaves no values behind when it is recorded
             for tensor in new:
                 tensor.fill_(True if tensor.dtype == torch.bool else 113)
         self.tapes.append(tape)
         return result, tape.play
+
+
+class TapeBackend(Backend):
+    """A CPU that can record."""
+
+    can_record = True
+
+    def new_recorder(self) -> Recorder:
+        return TapeRecorder(self.device)

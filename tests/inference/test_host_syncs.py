@@ -1,6 +1,6 @@
-"""On a GPU a chunk waits for nothing: no value is asked for, and nothing is copied from the host.
+"""On a GPU the host never waits during a chunk: no value is read, and nothing is copied from the host.
 
-Without a GPU, by fake tensors: they say that they are on one, have no values, and every operation on them can be watched.
+Tested without a GPU by fake tensors: their device is a GPU, they have no values, and every operation on them can be watched.
 """
 
 import pytest
@@ -11,7 +11,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from lerobot_policy_pi05_geometry.geometry import encoder
-from lerobot_policy_pi05_geometry.inference import fused_weights, runner
+from lerobot_policy_pi05_geometry.inference import fused_weights
+from lerobot_policy_pi05_geometry.inference.backend import Backend
+from lerobot_policy_pi05_geometry.inference.sampler import ChunkSampler
+from lerobot_policy_pi05_geometry.inference.side_stream import SideStream
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from tests.entry_points import CHUNK, WRIST, make_batch, make_config, redraw, without
 from tests.geometry.da3.tiny import tiny_encoder
@@ -30,21 +33,16 @@ class NoCopies(TorchDispatchMode):
         return out
 
 
-class NoWeights:
-    """Instead of a look at the addresses of weights, which fake ones do not have."""
+class WithoutStreams(Backend):
+    """A GPU whose streams need no GPU."""
 
-    def __init__(self, network, copied) -> None:
-        assert not copied
-
-    def stale(self) -> bool:
-        return False
+    def new_side_stream(self) -> SideStream:
+        return SideStream(torch.device("cpu"))
 
 
 @pytest.fixture
 def fake(monkeypatch) -> FakeTensorMode:
     monkeypatch.setattr(fused_weights, "_already_joined", lambda weights: None)
-    monkeypatch.setattr(runner, "Weights", NoWeights)
-    monkeypatch.setattr(runner, "SideStream", lambda device, kind=runner.SideStream: kind(torch.device("cpu")))
     arriving = encoder._CameraStatus(torch.ones(2, dtype=torch.bool), None, set())  # what was seen before
     monkeypatch.setattr(encoder._CameraStatus, "of", lambda alive, missing: arriving)
     return FakeTensorMode(allow_non_fake_inputs=True)
@@ -77,6 +75,7 @@ def on_gpu(mode: FakeTensorMode, tree):
 def test_no_value_is_asked_for_and_nothing_copied(fake, changes) -> None:
     encoder = {"encoder": tiny_encoder()} if changes.get("geometry_source") == "da3" else {}
     policy = PI05GeometryPolicy(make_config(**changes), **encoder).eval()
+    policy.sampler = ChunkSampler(policy.model, WithoutStreams)
     batch, noise = make_batch(1), torch.randn(1, CHUNK, 8)
     with fake:
         for module in [policy, *encoder.values()]:

@@ -1,7 +1,6 @@
 """The policy on a robot: chunks, the action queue, failing cameras, real-time chunking."""
 
 import math
-from functools import partial
 
 import pytest
 import torch
@@ -11,8 +10,6 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 
 from lerobot_policy_pi05_geometry.data.images import prepare_images
-from lerobot_policy_pi05_geometry.inference.cuda_graphs import GraphRunner
-from lerobot_policy_pi05_geometry.inference.runner import ChunkRunner
 from lerobot_policy_pi05_geometry.inference.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from tests.entry_points import (
@@ -29,7 +26,7 @@ from tests.entry_points import (
     make_policy,
     without,
 )
-from tests.inference.tape import TapeRecorder
+from tests.inference.tape import TapeBackend
 
 # --- acting -------------------------------------------------------------------------------------------------------
 
@@ -99,16 +96,15 @@ def test_a_depth_camera_may_fail_in_the_middle_of_an_episode(caplog):
 # --- recorded chunks ------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def recording(monkeypatch) -> None:
-    """Policies act as on a GPU: chunks are recorded, by tapes instead of CUDA graphs."""
-    on_tape = partial(GraphRunner, new_recorder=TapeRecorder)
-    monkeypatch.setattr(ChunkSampler, "_class", lambda sampler, runner: ChunkRunner if runner == "eager" else on_tape)
+def record(policy: PI05GeometryPolicy) -> PI05GeometryPolicy:
+    """The policy acts as on a GPU: chunks are recorded, by tapes instead of CUDA graphs."""
+    policy.sampler = ChunkSampler(policy.model, TapeBackend)
+    return policy
 
 
 @pytest.mark.parametrize("changes", [{}, {"geometry_placement": "prefix"}, {"geometry_source": "none"}], ids=str)
-def test_recorded_chunks_follow_whatever_the_robot_sees(recording, changes):
-    policy = make_policy(absent_cameras=[WRIST], **changes)
+def test_recorded_chunks_follow_whatever_the_robot_sees(changes):
+    policy = record(make_policy(absent_cameras=[WRIST], **changes))
     sizes, blind = set(), without(make_batch(1), FRONT_DEPTH, WRIST_DEPTH)
     seen = [
         make_batch(1),
@@ -131,32 +127,24 @@ def test_recorded_chunks_follow_whatever_the_robot_sees(recording, changes):
     assert policy.sampler.explain("eager")["prompt"] == "as long as the longest of the batch"
 
 
-def test_recorded_chunks_are_declined_where_guidance_is_asked_for(recording, caplog):
-    policy, batch = make_rtc_policy(), make_batch(1)
-    left_over = {"prev_chunk_left_over": torch.randn(1, 4, ACTION_DIM), "inference_delay": 1, "execution_horizon": 4}
-    assert policy.predict_action_chunk(batch, **left_over).isfinite().all()
-    assert "real-time chunking" in caplog.text
-    assert policy.sampler.explain()["runner"].startswith("declined: real-time chunking")
-
-
 # --- real-time chunking -------------------------------------------------------------------------------------------
 
 
-def make_rtc_policy(enabled: bool = True) -> PI05GeometryPolicy:
+def make_rtc_policy(enabled: bool = True, **changes) -> PI05GeometryPolicy:
     config = RTCConfig(
         enabled=enabled,
         execution_horizon=4,
         prefix_attention_schedule=RTCAttentionSchedule.LINEAR,
         max_guidance_weight=5.0,
     )
-    return make_policy(rtc_config=config)
+    return make_policy(rtc_config=config, **changes)
 
 
 def test_guided_chunks_follow_what_is_left_of_the_previous_one():
     policy, batch, noise = make_rtc_policy(), make_batch(1), torch.randn(1, CHUNK, 8)
     plain = make_policy().predict_action_chunk(batch, noise=noise, runner="plain")
     unguided = policy.predict_action_chunk(batch, noise=noise)
-    assert torch.equal(unguided, plain)  # nothing is left over yet
+    torch.testing.assert_close(unguided, plain, atol=1e-5, rtol=0)  # nothing is left over yet
     left_over = plain + 1.0
     guided = policy.predict_action_chunk(
         batch, noise=noise, prev_chunk_left_over=left_over, inference_delay=2, execution_horizon=4
@@ -185,6 +173,69 @@ def test_guidance_is_lerobots(left):
         velocity, noise, 3, rtc_processor=RTCProcessor(policy.config.rtc_config), rtc_enabled=True, **rtc
     )
     torch.testing.assert_close(guided, expected[..., :ACTION_DIM], atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"rtc_mode": "trained", "rtc_training_max_delay": 3}], ids=["guided", "trained"]
+)
+def test_real_time_chunking_is_served_by_the_runner(changes, caplog):
+    """Recorded once, for chunks with and without a previous one, of any length, delay and horizon."""
+    policy = record(make_rtc_policy(**changes))
+    for seed, (left, delay, horizon) in enumerate([(0, None, None), (6, 2, 4), (3, 3, None), (CHUNK, 0, 2)]):
+        batch, noise = make_batch(2, seed), torch.randn(2, CHUNK, 8)
+        rtc = {"inference_delay": delay, "execution_horizon": horizon}
+        if left:
+            rtc["prev_chunk_left_over"] = torch.randn(2, left, ACTION_DIM)
+        found, plain = (policy.predict_action_chunk(batch, noise=noise, runner=r, **rtc) for r in ("fast", "plain"))
+        torch.testing.assert_close(found, plain, atol=1e-5, rtol=1e-5)
+    assert policy.sampler.explain()["CUDA graphs"].startswith("active: 1 of")
+    assert not caplog.records
+
+
+def test_trained_real_time_chunking_keeps_what_is_executed():
+    policy = make_rtc_policy(rtc_mode="trained", rtc_training_max_delay=3)
+    batch, noise, left = make_batch(1), torch.randn(1, CHUNK, 8), torch.randn(1, 5, ACTION_DIM)
+    with_prefix, without_prefix = (
+        policy.predict_action_chunk(batch, noise=noise, prev_chunk_left_over=left, inference_delay=delay)
+        for delay in (2, 0)
+    )
+    assert torch.equal(with_prefix[:, :2], left[:, :2])
+    assert ((with_prefix - without_prefix)[:, 2:].abs().amax(dim=(0, 2)) > 1e-4).all()  # all others follow it
+    unguided = make_policy().predict_action_chunk(batch, noise=noise)
+    torch.testing.assert_close(without_prefix, unguided, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("runner", ["fast", "plain"])
+def test_what_is_left_over_must_fit(runner):
+    policy = make_rtc_policy(rtc_mode="trained", rtc_training_max_delay=3)
+    for left, delay, says in [
+        (torch.zeros(1, 5, ACTION_DIM), None, "needs inference_delay"),
+        (torch.zeros(1, 5, ACTION_DIM), 4, "trained with rtc_training_max_delay=3"),
+        (torch.zeros(1, 2, ACTION_DIM), 3, "has only 2 steps"),
+        (torch.zeros(1, CHUNK + 1, ACTION_DIM), 1, r"T <= \d+ and A <= 8, got"),
+        (torch.zeros(3, 5, ACTION_DIM), 1, "B = 1"),
+    ]:
+        with pytest.raises(ValueError, match=says):
+            policy.predict_action_chunk(make_batch(1), prev_chunk_left_over=left, inference_delay=delay, runner=runner)
+
+
+def test_the_mode_must_be_one_the_policy_was_trained_for():
+    with pytest.raises(
+        ValueError, match="rtc_mode=trained needs a policy that was trained with rtc_training_max_delay"
+    ):
+        make_rtc_policy(rtc_mode="trained")
+    with pytest.raises(ValueError, match="rtc_mode must be one of guided, trained, got 'hard'"):
+        make_rtc_policy(rtc_mode="hard")
+    with pytest.raises(ValueError, match="rtc_training_max_delay must be at least 0 and less than chunk_size"):
+        make_policy(rtc_training_max_delay=CHUNK)
+
+
+def test_debugging_takes_the_plain_path(caplog):
+    """LeRobot's tracker wants every denoising step."""
+    policy = make_policy(rtc_config=RTCConfig(debug=True))
+    policy.predict_action_chunk(make_batch(1))
+    assert "rtc_config.debug records every denoising step" in caplog.text
+    assert policy.rtc_processor.get_all_debug_steps()
 
 
 def test_rtc_works_on_whole_chunks():

@@ -16,7 +16,7 @@ indices = st.integers(-1, 2**40)
 
 
 def draw(seed: int, step: int, indices: list[int]) -> FlowDraw:
-    return draw_flow(seed, step, indices, SHAPE, **BETA)
+    return draw_flow(seed, step, indices, SHAPE, **BETA, max_delay=5)
 
 
 def same(a: FlowDraw, b: FlowDraw) -> bool:
@@ -25,7 +25,7 @@ def same(a: FlowDraw, b: FlowDraw) -> bool:
 
 def nothing_shared(a: FlowDraw, b: FlowDraw) -> bool:
     """No number of one draw occurs anywhere in the other, so neither is a shifted copy."""
-    return not any(torch.isin(x, y).any() for x, y in zip(a, b, strict=True))
+    return not any(torch.isin(x, y).any() for x, y in zip(a, b, strict=True) if x.is_floating_point())
 
 
 @given(seeds, steps, indices)
@@ -66,10 +66,11 @@ def test_the_batch_does_not_matter(members: list[int], random) -> None:
 
 
 def test_shapes_and_types() -> None:
-    """(B, S, D), and (B,) for the rest, all float32."""
+    """(B, S, D), and (B,) for the rest, all float32 but the delay."""
     drawn = draw(0, 0, [5, 6])
-    assert [tuple(x.shape) for x in drawn] == [(2, 4, 3), (2,), (2,), (2,)]
-    assert {x.dtype for x in drawn} == {torch.float32}
+    assert [tuple(x.shape) for x in drawn] == [(2, 4, 3), (2,), (2,), (2,), (2,)]
+    assert {x.dtype for x in drawn[:-1]} == {torch.float32}
+    assert drawn.delay.dtype == torch.int64
 
 
 @pytest.mark.parametrize("vary", ["step", "index"])
@@ -77,9 +78,9 @@ def test_distributions(vary: str) -> None:
     """Noise is standard normal, time is Beta(1.5, 1) in [0.001, 1], the rest uniform: over steps and over samples."""
     count = 4000
     if vary == "index":
-        noise, time, *uniform = draw(3, 7, list(range(count)))
+        noise, time, *uniform, _ = draw(3, 7, list(range(count)))
     else:
-        noise, time, *uniform = (
+        noise, time, *uniform, _ = (
             torch.cat(parts) for parts in zip(*(draw(3, step, [7]) for step in range(count)), strict=True)
         )
     assert abs(noise.mean()) < 0.02
@@ -98,9 +99,9 @@ def test_distributions(vary: str) -> None:
 
 def test_the_draws_are_independent() -> None:
     """No two of the draws of a sample are correlated, and neither are those of two steps."""
-    noise, *rest = draw(4, 0, list(range(4000)))
+    noise, *rest, delay = draw(4, 0, list(range(4000)))
     later = draw(4, 1, list(range(4000))).noise
-    columns = torch.stack([noise[:, 0, 0], noise[:, 1, 0], later[:, 0, 0], *rest])
+    columns = torch.stack([noise[:, 0, 0], noise[:, 1, 0], later[:, 0, 0], *rest, delay.float()])
     correlation = torch.corrcoef(columns) - torch.eye(len(columns))
     assert correlation.abs().max() < 0.06
 
@@ -108,12 +109,23 @@ def test_the_draws_are_independent() -> None:
 def test_several_flow_samples() -> None:
     """K noises and times per observation, no two alike, and one of the other draws; keyed like a single one."""
     drawn = draw_flow(0, 0, [5, 6], SHAPE, **BETA, samples=3)
-    assert [tuple(x.shape) for x in drawn] == [(2, 3, 4, 3), (2, 3), (2,), (2,)]
+    assert [tuple(x.shape) for x in drawn] == [(2, 3, 4, 3), (2, 3), (2,), (2,), (2,)]
     noise, time, *_ = drawn
     assert len(noise.unique()) == noise.numel()
     assert len(time.unique()) == time.numel()
     alone = draw_flow(0, 0, [6], SHAPE, **BETA, samples=3)
     assert same(alone, FlowDraw(*(x[1:] for x in drawn)))
+
+
+def test_delays_are_uniform_and_change_no_other_draw() -> None:
+    """From 0 to the longest, both included; without delays all else is as it was."""
+    drawn = draw(0, 0, list(range(3000)))
+    counts = torch.bincount(drawn.delay)
+    assert len(counts) == 6
+    assert ((counts - 500).abs() < 100).all()
+    without = draw_flow(0, 0, list(range(3000)), SHAPE, **BETA)
+    assert not without.delay.any()
+    assert same(drawn._replace(delay=without.delay), without)
 
 
 def test_alpha_and_beta_are_used() -> None:

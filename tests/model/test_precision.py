@@ -5,7 +5,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_policy_pi05_geometry.model import PI05Pytorch
-from lerobot_policy_pi05_geometry.model.gemma import AdaRMSNorm, RMSNorm
+from lerobot_policy_pi05_geometry.model.norms import AdaRMSNorm, RMSNorm
 from lerobot_policy_pi05_geometry.model.precision import Float32Linear, compute_in
 from lerobot_policy_pi05_geometry.model.segment_gate import GeometryGate
 

@@ -9,7 +9,7 @@ from torch import nn
 from torch._subclasses import FakeTensorMode
 from torch.distributed._tools.mem_tracker import MemTracker
 
-from lerobot_policy_pi05_geometry.planner.acting import CountedSide
+from lerobot_policy_pi05_geometry.planner.acting import with_memory_kept
 from lerobot_policy_pi05_geometry.planner.counting import MemoryCounter, MemorySplit, storage_bytes
 
 
@@ -87,7 +87,7 @@ def test_what_runs_beside_recorded_graphs_does_not_use_their_memory():
         graphs = torch.empty(1000, dtype=torch.uint8)
         result = torch.empty(10, dtype=torch.uint8)
         del graphs
-        beside = CountedSide(counter).run(lambda: torch.empty(400, dtype=torch.uint8))
+        beside = with_memory_kept(counter, lambda: torch.empty(400, dtype=torch.uint8))
         after = torch.empty(500, dtype=torch.uint8)  # in the graphs' memory again
     assert (counter.peak.total, counter.spare) == (1410, 1410 - 910)
     assert result.nbytes + beside.nbytes + after.nbytes == 910

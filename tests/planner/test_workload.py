@@ -5,13 +5,13 @@ import weakref
 
 import pytest
 import torch
-from torch.profiler import ProfilerActivity, profile
 
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from lerobot_policy_pi05_geometry.planner.counting import storage_bytes
 from lerobot_policy_pi05_geometry.planner.workload import FakePolicy, Load
 from tests.entry_points import TOKENS, make_batch, make_config, without
+from tests.planner.allocations import allocated
 
 PROMPT = make_batch()[TOKENS].shape[1]
 SETTINGS = [
@@ -36,18 +36,6 @@ def load(size: int, **changes) -> Load:
 
 def fake(lora_rank: int | None = None, **changes) -> FakePolicy:
     return FakePolicy(make_config(**changes), lora_rank)
-
-
-def allocated(run) -> int:
-    """What PyTorch's allocator holds at most while this runs, above what it held before."""
-    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
-        run()
-    events = [e for e in profiler.profiler.kineto_results.events() if e.name() == "[memory]"]
-    now = highest = 0
-    for event in sorted(events, key=lambda e: e.start_ns()):
-        now += event.nbytes()
-        highest = max(highest, now)
-    return highest
 
 
 def real(size: int, **changes) -> tuple[PI05GeometryPolicy, dict]:
@@ -116,14 +104,14 @@ def test_lora_equals_the_allocator(tmp_path, targets, dtypes):
     ids=str,
 )
 def test_inference_equals_the_allocator(changes, runner):
-    """To 2 % and the memory in which the CPU's convolution puts its weights into another order."""
+    """To 2 %."""
     policy, batch = real(16, inference_runner=runner, **changes)
     del batch["action"]
     policy.predict_action_chunk(batch)
     before = storage_bytes([*policy.parameters(), *policy.buffers(), *batch.values(), *policy.sampler.tensors()])
     measured = before + allocated(lambda: policy.predict_action_chunk(batch))
     predicted = fake(inference_runner=runner, **changes).inference(load(16)).total
-    assert 0.98 * (measured - 4 * 32 * 3 * 14**2) <= predicted <= 1.02 * measured
+    assert predicted == pytest.approx(measured, rel=0.02)
 
 
 @pytest.mark.parametrize("changes", [{}, *(s for s in SETTINGS if TRAINING_ONLY & set(s))][:4] + SETTINGS[-1:], ids=str)
@@ -209,7 +197,7 @@ def test_the_runners_modulations_of_every_denoising_step_are_there():
     # Two norms a layer and the last; the three that a norm's linear map gives at once, and them stacked; float32.
     modulations = 1600 * (2 * expert.depth + 1) * (3 + 3) * expert.width * 4
     assert many.total - few.total == pytest.approx(modulations, rel=0.05)  # the embedded flow times beside
-    assert many.weights == few.weights
+    assert many.weights > few.weights  # they outlive the chunk
 
 
 def test_micro_batches_need_what_one_needs_and_the_gradients():

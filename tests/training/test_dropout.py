@@ -16,7 +16,7 @@ NAMES = ("front", "wrist", "left", "right")
 
 def draws(u: torch.Tensor, which: torch.Tensor) -> FlowDraw:
     nothing = torch.zeros(len(u))
-    return FlowDraw(nothing, nothing, u, which)
+    return FlowDraw(nothing, nothing, u, which, nothing)
 
 
 @st.composite

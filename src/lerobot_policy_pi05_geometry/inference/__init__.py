@@ -1,1 +1,1 @@
-"""The network's arithmetic without its modules: a whole action chunk, fast. `PI05Pytorch.sample_actions` is the reference."""
+"""A whole action chunk, fast. `PI05Pytorch.sample_actions` is the reference that it equals."""

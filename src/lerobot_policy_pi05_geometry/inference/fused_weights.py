@@ -1,43 +1,44 @@
-"""Weights of one segment's layers in the form that the runner wants: fewer and larger matrices, in the compute dtype.
+"""The weights of a segment's layers as the runner reads them: fewer and larger matrices, in the compute dtype.
 
 ```
    q_proj | k_proj | v_proj  ─►  one matrix          gate_proj | up_proj  ─►  one matrix
 ```
 
-Where a weight is stored in the compute dtype already, the network's own parameters become views of the large matrix: nothing
-is held twice, and what changes the one in place changes the other. Otherwise (bf16 compute over float32 storage) the large
-matrices are copies; `Weights.stale` tells when the network has moved on.
+Where a weight is stored in the compute dtype, the network's own parameters become views of the large matrix. Nothing is held
+twice, and a write to one is a write to the other. Otherwise (bf16 compute, float32 storage) the large matrices are copies.
 """
 
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.optimizer import register_optimizer_step_post_hook
 
-from ..model.gemma import GemmaLayer, GemmaModel, RMSNorm
+from ..model.gemma import GemmaLayer, GemmaModel
+from ..model.norms import RMSNorm
 
-_DONE: Counter[str] = Counter()  # "steps" of any optimiser of this process
+# The parameters of a layer. The runner computes with these and no others.
+_PROJECTIONS = {
+    "self_attn.q_proj",
+    "self_attn.k_proj",
+    "self_attn.v_proj",
+    "self_attn.o_proj",
+    "mlp.gate_proj",
+    "mlp.up_proj",
+    "mlp.down_proj",
+}
+_NORMS = {"input_layernorm", "post_attention_layernorm"}
 
 
-def _count_step(*_: Any) -> None:
-    _DONE["steps"] += 1
-
-
-# torch's fused optimisers leave the versions of what they write as they were
-register_optimizer_step_post_hook(_count_step)
-
-
-class NotPlainError(TypeError):
-    """A projection cannot be joined with others."""
+class UnsupportedLayerError(TypeError):
+    """A layer has a module that the runner cannot compute with, such as an unmerged LoRA."""
 
 
 @dataclass(frozen=True)
 class FusedLayer:
-    """One layer's matrices, (out, in) in the compute dtype, and the weights of its plain norms, (W,) float32 or None."""
+    """One layer's matrices, (out, in) in the compute dtype, and the weights of its plain norms, (W,) float32.
+
+    The weights of adaptive norms are None: their scale follows the flow time.
+    """
 
     qkv: Tensor
     out: Tensor
@@ -48,12 +49,13 @@ class FusedLayer:
 
 
 def fuse(model: GemmaModel, dtype: torch.dtype) -> list[FusedLayer]:
-    """All layers of a segment's transformer. Raises NotPlainError for a projection that is not a plain linear layer."""
+    """All layers of a segment's transformer. Raises UnsupportedLayerError for a layer with other modules than Gemma's."""
     return [_fuse_layer(layer, dtype) for layer in model.layers]
 
 
 def _fuse_layer(layer: nn.Module, dtype: torch.dtype) -> FusedLayer:
     assert isinstance(layer, GemmaLayer)
+    _require_known_modules(layer)
     attention, mlp = layer.self_attn, layer.mlp
     return FusedLayer(
         qkv=_join([attention.q_proj, attention.k_proj, attention.v_proj], dtype),
@@ -65,21 +67,22 @@ def _fuse_layer(layer: nn.Module, dtype: torch.dtype) -> FusedLayer:
     )
 
 
-def copied(model: GemmaModel, dtype: torch.dtype) -> list[Tensor]:
-    """The weights of which the runner has copies: those of another dtype."""
-    weights = (module.weight.detach() for module in model.layers.modules() if type(module) is nn.Linear)
-    return [weight for weight in weights if weight.dtype != dtype]
+def _require_known_modules(layer: GemmaLayer) -> None:
+    for name, module in layer.named_modules():
+        if name in _PROJECTIONS and (type(module) is not nn.Linear or module.bias is not None):
+            raise UnsupportedLayerError(f"a projection is a {type(module).__name__}, not a plain linear layer")
+    for name, _ in layer.named_parameters():
+        owner = name.rpartition(".")[0]
+        if owner not in _PROJECTIONS and owner.removesuffix(".dense") not in _NORMS:
+            raise UnsupportedLayerError(f"a layer has the parameter {name}, which the runner does not know")
 
 
 def _norm_weight(norm: nn.Module) -> Tensor | None:
-    """Of a plain norm, in its own storage; None for an adaptive one, whose scale follows the flow time."""
+    """The weight of a plain norm, in its own storage; None for an adaptive norm."""
     return norm.weight.detach() if isinstance(norm, RMSNorm) else None
 
 
 def _join(linears: list[nn.Linear], dtype: torch.dtype) -> Tensor:
-    for linear in linears:
-        if type(linear) is not nn.Linear or linear.bias is not None:
-            raise NotPlainError(f"a projection is a {type(linear).__name__}, not a plain linear layer")
     weights = [linear.weight for linear in linears]
     if weights[0].dtype != dtype:
         return torch.cat([weight.detach().to(dtype) for weight in weights])
@@ -96,46 +99,12 @@ def _join(linears: list[nn.Linear], dtype: torch.dtype) -> Tensor:
 
 
 def _already_joined(weights: list[Tensor]) -> Tensor | None:
-    """The large matrix that these weights are the rows of, if they stand one after the other in one storage."""
-    storage, place = weights[0].untyped_storage(), weights[0].storage_offset()
+    """The large matrix whose rows these weights are, if they stand one after the other in one storage."""
+    storage, offset = weights[0].untyped_storage(), weights[0].storage_offset()
     for weight in weights:
         same = weight.untyped_storage()._cdata == storage._cdata
-        if not same or weight.storage_offset() != place or not weight.is_contiguous():
+        if not same or weight.storage_offset() != offset or not weight.is_contiguous():
             return None
-        place += weight.numel()
+        offset += weight.numel()
     first, rows = weights[0].detach(), sum(weight.shape[0] for weight in weights)
     return first.as_strided((rows, first.shape[1]), (first.shape[1], 1))
-
-
-class Weights:
-    """Remembers a network's modules, parameters and where they lie, and what those hold from which something was computed.
-
-    read: these last. A write through `parameter.data` leaves no version behind, so vectors and the diagonals of matrices are
-    compared, too: they show whatever changes a weight as a whole (an average of weights, say), not every single entry.
-    """
-
-    def __init__(self, network: nn.Module, read: Sequence[Tensor] = ()) -> None:
-        # Held, or a module that comes later could have the address of one that went.
-        self._modules = list(network.modules())
-        self._members = [
-            entries for module in self._modules for entries in (module._modules, module._parameters) if entries
-        ]
-        self._parameters = list(network.parameters())
-        self._read = list(read)
-        self._seen = self._look()
-        if self._read:
-            self._values = self._sample()
-
-    def _look(self) -> tuple[int, ...]:
-        members = (id(member) for entries in self._members for member in entries.values())
-        places = tuple((p.untyped_storage()._cdata, p.storage_offset()) for p in self._parameters)
-        writes = (sum(weight._version for weight in self._read), _DONE["steps"]) if self._read else ()
-        return (hash(tuple(members)), hash(places), *writes)
-
-    def _sample(self) -> Tensor:
-        """Some of the values, as bits (a NaN does not equal itself)."""
-        return torch.cat([weight.diagonal() if weight.ndim == 2 else weight for weight in self._read]).view(torch.uint8)
-
-    def stale(self) -> bool:
-        """Whether the network is another than it was. On a GPU this waits for it if there is anything to compare."""
-        return self._look() != self._seen or (bool(self._read) and not torch.equal(self._values, self._sample()))

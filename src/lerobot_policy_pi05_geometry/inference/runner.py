@@ -1,17 +1,17 @@
 """A whole action chunk, fast: the network's arithmetic without its modules. `PI05Pytorch.sample_actions` is the reference.
 
 ```
-   once per weights   fused matrices (fused_weights.py)
-   once per chunk     look: vision and text as in the plain path, then the prefix through its layers into the cache
-                            (meanwhile geometry is measured: side_stream.py)
-                      act:  geometry through its layers into the cache; the suffix's masks, with the gate in them
-   once per step            the suffix through its layers: four matrix products, one attention, one cache write a layer
+   once per weights   joined matrices (fused_weights.py); modulations of all norms at all flow times (layers.py: FlowTime)
+   once per chunk     prefill: vision and text as in the plain path, then the prefix through its layers into the cache
+                               (meanwhile geometry is measured: side_stream.py)
+                      denoise: geometry through its layers into the cache; the suffix's masks, with the gate in them
+   once per step               the suffix through its layers: four matrix products, one attention, one cache write a layer
 ```
 
-What depends on the flow time alone, the modulations of all norms, is computed for all steps at once; on a CPU it is kept until
-weights change, on a GPU it is part of `act`, since to see whether they changed is to wait. What depends on the observation alone
-is computed once per chunk and not in every layer. Nothing is approximated: in float32 the result is the plain path's to rounding.
-`look` and `act` compute tensors from tensors without looking at a value, so a GPU can record them and need not be waited for.
+Nothing is approximated: in float32 the result equals the plain path's to rounding. `prefill` and `denoise` compute tensors from
+tensors and read no value, so a GPU can record them and the host does not wait for it.
+
+A runner holds for the weights that it was built from. sampler.py says when a new one is built.
 
 Shapes: B batch, N tokens of a segment, W width, H heads, KV key/value heads, D head_dim, K keys up to the segment's end.
 """
@@ -22,21 +22,24 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_leaves
 
-from ..model.attention import rotary_table
+from ..model.attention import logit_bias, rotary_table
+from ..model.norms import Modulation
 from ..model.pi05 import PI05Pytorch
-from ..model.precision import Float32Linear, compute_in
+from ..model.precision import compute_in
+from ..model.real_time_chunking import Guidance, HardPrefix, make_guidance, make_hard_prefix
 from ..model.segment_cache import SegmentKVCache
 from ..model.segment_mask import segment_mask
 from ..model.segments import GeometryTokens, Segment, SegmentTokens, one_block, segment_positions
-from .fused_weights import FusedLayer, Weights, copied, fuse
-from .layers import LayerModulation, Modulation, SegmentFrame, adaptive_norm, run_layers, write_attention_out
-from .side_stream import PendingGeometry, SideStream
+from .backend import Backend
+from .fused_weights import FusedLayer, fuse
+from .layers import FlowTime, SegmentFrame, run_layers
+from .side_stream import PendingGeometry
+from .weight_versions import WeightVersions
 
 
 class Observation(NamedTuple):
-    """What `PI05Pytorch.embed_prefix` takes. An absent camera is None, so which are there is known without a look at a value."""
+    """The arguments of `PI05Pytorch.embed_prefix`. An absent camera is None, so no value has to be read to know it."""
 
     images: Sequence[Tensor | None]
     img_masks: Sequence[Tensor]
@@ -45,104 +48,74 @@ class Observation(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What actions are denoised from: which prefix tokens are real, (B, P) bool, and the cache."""
+    """What actions are denoised from: the mask of the prefix tokens, (B, P) bool, and the cache."""
 
     prefix_pad: Tensor
     cache: SegmentKVCache
 
 
-class FlowTime(NamedTuple):
-    """What modulates an expert at one flow time: every layer, and the final norm."""
+class GeometryPass(NamedTuple):
+    """Geometry as a segment, with its rotary tables and masks."""
 
-    layers: Sequence[LayerModulation]
-    last: Modulation
-
-
-class Chunk(NamedTuple):
-    """The two halves of a chunk, for inputs of certain shapes. Geometry goes into one of them, and None into the other."""
-
-    look: Callable[[Observation, GeometryTokens | None], Context]
-    act: Callable[[Context, Tensor, GeometryTokens | None], Tensor]
+    segment: SegmentTokens
+    frame: SegmentFrame
 
 
-def why_not(network: PI05Pytorch) -> str | None:
-    """Why the runner cannot run this network, as the rest of a sentence; None if it can."""
-    geometry = network.config.geometry
-    if geometry is not None and geometry.time == "denoise":
-        return "geometry_time=denoise recomputes geometry at every step"
-    return None
+class ChunkSettings(NamedTuple):
+    """Numbers that a chunk depends on. geometry_tokens: wherever they stand. lengths: of the geometry segment and the suffix."""
+
+    geometry_tokens: int
+    lengths: tuple[int, int]
+    num_steps: int
+    max_guidance_weight: float
+
+
+class ChunkFunctions(NamedTuple):
+    """The two halves of a chunk, for inputs of certain shapes. Geometry goes into one of them, None into the other."""
+
+    prefill: Callable[[Observation, GeometryTokens | None], Context]
+    denoise: Callable[[Context, Tensor, GeometryTokens | None, Guidance | HardPrefix | None], Tensor]
 
 
 class ChunkRunner:
-    """Runs a network. Raises NotPlainError for projections that are not plain linear layers (an unmerged LoRA)."""
+    """Runs a network that is in evaluation mode, with the weights that it has now.
 
-    def __init__(self, network: PI05Pytorch) -> None:
-        self.network, self.config = network, network.config
-        self._build()
+    backend: the device's, unless given. Raises UnsupportedLayerError for layers that the runner cannot compute with (an unmerged
+    LoRA), and ValueError for a network in training mode.
+    """
 
-    def refresh(self) -> None:
-        """Build anew if the network has changed: training went on, a LoRA came or was merged, or it moved elsewhere."""
-        if self._weights.stale():
-            self._build()
-
-    @torch.inference_mode(False)  # or the joined weights could never again be trained
+    @torch.inference_mode(False)  # the joined weights of inference mode could not be trained any more
     @torch.no_grad()
-    def _build(self) -> None:
-        """The weights as the runner wants them."""
-        network, dtype = self.network.paligemma_with_expert, self.config.dtype
-        self.device = self.network.action_in_proj.weight.device
-        models = {segment: network.segment_model(segment) for segment in Segment}
+    def __init__(self, network: PI05Pytorch, backend: Backend | None = None) -> None:
+        if network.training:
+            raise ValueError("The runner needs a network in evaluation mode; call eval() first.")
+        self.network, self.config = network, network.config
+        self.device = network.action_in_proj.weight.device
+        self.backend = backend or Backend(self.device)
+        self._models = {segment: network.paligemma_with_expert.segment_model(segment) for segment in Segment}
         fused: dict[int, list[FusedLayer]] = {}
-        read: list[Tensor] = []
-        for model in {id(model): model for model in models.values()}.values():
-            fused[id(model)] = fuse(model, dtype)
-            read += copied(model, dtype)
-        self._models = models
-        self._layers = {segment: fused[id(model)] for segment, model in models.items()}
-        self._side = SideStream(self.device)
-        self._kept: dict[tuple[Segment, int], list[FlowTime]] = {}
-        if self._may_look:  # what modulations are kept of: the norms' linear maps and the flow time's
-            linears = [module for module in self.network.modules() if isinstance(module, Float32Linear)]
-            read += [parameter.detach() for linear in linears for parameter in linear.parameters()]
-        self._weights = Weights(self.network, read)
+        for model in self._models.values():
+            if id(model) not in fused:
+                fused[id(model)] = fuse(model, self.config.dtype)
+        self._layers = {segment: fused[id(model)] for segment, model in self._models.items()}
+        self._flow_times: dict[tuple[int, tuple[float, ...]], list[FlowTime]] = {}
+        self._side = self.backend.new_side_stream()
+        self._weights = WeightVersions(network)
+
+    def is_current(self) -> bool:
+        """Whether the network still has the weights that the runner was built from (weight_versions.py), where they were."""
+        return self.network.action_in_proj.weight.device == self.device and self._weights.unchanged()
 
     def tensors(self) -> list[Tensor]:
-        """All that is kept between chunks; some of it is the network's own storage (fused_weights.py)."""
-        matrices = (m for layers in self._layers.values() for layer in layers for m in vars(layer).values())
-        return [tensor for tensor in (*matrices, *tree_leaves(list(self._kept.values()))) if isinstance(tensor, Tensor)]
+        """The tensors that outlive a chunk; some of them are the network's own storage (fused_weights.py)."""
+        matrices = [m for layers in self._layers.values() for layer in layers for m in vars(layer).values()]
+        modulations = [tensor for times in self._flow_times.values() for time in times for tensor in time]
+        return [tensor for tensor in (*matrices, *modulations) if isinstance(tensor, Tensor)]
 
-    def _modulations(self, segment: Segment, times: Sequence[float]) -> list[FlowTime]:
-        """What modulates an expert at these T flow times."""
-        # Filled on the device: what is fetched from the host cannot be recorded.
-        flow_times = torch.cat([torch.full((1,), time, device=self.device) for time in times])
-        cond, model = self.network.embed_time(flow_times), self._models[segment]  # (T, W)
-        norms = [norm for x in model.layers for norm in (x.input_layernorm, x.post_attention_layernorm)]
-        given = torch.stack([norm.dense(cond) for norm in (*norms, model.norm)], dim=1)  # (T, norms, 3 W)
-        scale, shift, gate = given.chunk(3, dim=-1)
-        found = []
-        for rows in zip(1.0 + scale, shift, gate.to(self.config.dtype), strict=True):
-            *each, last = (Modulation(*row) for row in zip(*rows, strict=True))
-            found.append(FlowTime(list(zip(each[::2], each[1::2], strict=True)), last))
-        return found
-
-    def _schedule(self, segment: Segment, num_steps: int) -> list[FlowTime]:
-        """Of the suffix at every denoising step; of geometry at the clean end of the flow."""
-        key = segment, num_steps
-        if key in self._kept:
-            return self._kept[key]
-        times = [1.0 - step / num_steps for step in range(num_steps)] if segment is Segment.SUFFIX else [0.0]
-        schedule = self._modulations(segment, times)
-        if self._may_look:
-            self._kept[key] = schedule
-        return schedule
-
-    def __call__(self, *observation: Any, **kwargs: Any) -> Tensor:
-        """An action chunk (B, S, D) float32 from the weights as they are now; arguments as in `sample`."""
-        self.refresh()
-        return self.sample(*observation, **kwargs)
+    # --- a chunk ------------------------------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def sample(
+    def __call__(
         self,
         images: Sequence[Tensor | None],
         img_masks: Sequence[Tensor],
@@ -153,10 +126,13 @@ class ChunkRunner:
         geom_embs: Tensor | None = None,
         geom_pad: Tensor | None = None,
         geometry: PendingGeometry | None = None,
+        inference_delay: int | None = None,
+        prev_chunk_left_over: Tensor | None = None,
+        execution_horizon: int | None = None,
     ) -> Tensor:
-        """An action chunk from the weights as they were last looked at; arguments as in `PI05Pytorch.sample_actions`.
+        """An action chunk (B, S, D) float32; arguments as in `PI05Pytorch.sample_actions`.
 
-        geometry: instead of geom_embs and geom_pad, what measures them once vision and prefix are on their way.
+        geometry: instead of geom_embs and geom_pad, geometry that is measured while the prefix is computed.
         """
         if noise is None:
             shape = (tokens.shape[0], self.config.chunk_size, self.config.max_action_dim)
@@ -164,73 +140,121 @@ class ChunkRunner:
         if geom_embs is not None:
             geometry = PendingGeometry.given(geom_embs, geom_pad)
         observation = Observation(images, img_masks, tokens, masks)
-        num_tokens = 0 if geometry is None else geometry.num_tokens
-        # None of the caller's autocast: vision and text have their own. It keeps no casts of weights, which are used once, and
-        # which would lie in a recorded graph's memory.
+        previous = self._previous_chunk(noise, prev_chunk_left_over, inference_delay, execution_horizon)
+        settings = self._settings(noise, num_steps, geometry)
+        # Vision and text have an autocast of their own. It caches no casts of weights: each is used once, and the cache would lie
+        # in a recorded graph's memory.
         with torch.autocast(self.device.type, enabled=False, cache_enabled=False):
-            chunk = self._chunk(observation, noise, num_steps or self.config.num_inference_steps, num_tokens)
+            self.compute_flow_times(settings.num_steps)
+            chunk = self._functions(observation, noise, previous, settings)
             early = late = None
             if geometry is not None and self.network.geometry_in_prefix:
                 early = geometry.measure()
             self._side.begin_here()
-            context = chunk.look(observation, early)
+            context = chunk.prefill(observation, early)
             if geometry is not None and early is None:
                 late = self._side.run(geometry.measure)
-            return chunk.act(context, noise, late)
+            return chunk.denoise(context, noise, late, previous)
 
-    def _chunk(self, observation: Observation, noise: Tensor, num_steps: int, num_tokens: int) -> Chunk:
-        """How to compute a chunk from such inputs. num_tokens: of geometry."""
-        room = (0 if self.network.geometry_in_prefix else num_tokens, noise.shape[1])
-        return Chunk(partial(self.look, room=room), partial(self.act, num_steps=num_steps))
+    def _previous_chunk(
+        self, noise: Tensor, left_over: Tensor | None, delay: int | None, horizon: int | None
+    ) -> Guidance | HardPrefix | None:
+        """The inputs of real-time chunking; None if it is off. Where nothing is left over they have no effect."""
+        network = self.network
+        if not network.rtc_enabled:
+            return None
+        if network.rtc_mode == "trained":
+            return make_hard_prefix(left_over, delay, self.config.rtc_training_max_delay, noise)
+        return make_guidance(network.rtc_processor, left_over, delay, horizon, noise)
 
-    # --- the two halves, and what they consist of ---------------------------------------------------------------------
+    def _settings(self, noise: Tensor, num_steps: int | None, geometry: PendingGeometry | None) -> ChunkSettings:
+        tokens = 0 if geometry is None else geometry.num_tokens
+        lengths = (0 if self.network.geometry_in_prefix else tokens, noise.shape[1])
+        rtc = self.network.rtc_processor
+        max_weight = 0.0 if rtc is None else rtc.rtc_config.max_guidance_weight
+        return ChunkSettings(tokens, lengths, num_steps or self.config.num_inference_steps, max_weight)
 
-    def look(self, observation: Observation, geometry: GeometryTokens | None, room: tuple[int, int]) -> Context:
-        """Vision, text and prefix; geometry only if it belongs there. room: tokens of the geometry segment and the suffix."""
-        return self.prefill(self.embed(observation, geometry), room)
+    def _functions(
+        self, observation: Observation, noise: Tensor, previous: Guidance | HardPrefix | None, settings: ChunkSettings
+    ) -> ChunkFunctions:
+        """The two halves of a chunk for inputs of these shapes."""
+        return ChunkFunctions(partial(self.prefill, settings=settings), partial(self.denoise, settings=settings))
 
-    def act(self, context: Context, noise: Tensor, geometry: GeometryTokens | None, num_steps: int) -> Tensor:
+    def prefill(self, observation: Observation, geometry: GeometryTokens | None, settings: ChunkSettings) -> Context:
+        """Vision, text and prefix into a new cache; geometry only if it belongs to the prefix."""
+        return self.prefill_prefix(self.embed_prefix(observation, geometry), settings.lengths)
+
+    def denoise(
+        self,
+        context: Context,
+        noise: Tensor,
+        geometry: GeometryTokens | None,
+        previous: Guidance | HardPrefix | None,
+        settings: ChunkSettings,
+    ) -> Tensor:
         """Actions (B, S, D) from noise of that shape; geometry is None if there is none or the prefix has it."""
-        return self.denoise(context, noise, self.prefill_geometry(context, geometry), num_steps)
+        return self.denoise_suffix(context, noise, self.prefill_geometry(context, geometry), previous, settings)
 
-    def embed(self, observation: Observation, geometry: GeometryTokens | None = None) -> SegmentTokens:
-        """Vision and text, and the geometry that belongs into the prefix."""
+    # --- the parts of the two halves ----------------------------------------------------------------------------------
+
+    def embed_prefix(self, observation: Observation, geometry: GeometryTokens | None = None) -> SegmentTokens:
+        """Vision and text, and geometry that belongs to the prefix."""
         with compute_in(self.config.dtype, self.device):
             prefix = self.network.embed_prefix(*observation)
             return prefix if geometry is None else prefix.followed_by(self.network.embed_geometry(*geometry))
 
-    def prefill(self, prefix: SegmentTokens, room: tuple[int, int]) -> Context:
-        """The prefix's keys and values in a new cache that has room for the other two segments."""
+    def prefill_prefix(self, prefix: SegmentTokens, lengths: tuple[int, int]) -> Context:
+        """The prefix's keys and values in a new cache for geometry and suffix of these lengths."""
         assert prefix.embs is not None
         batch, length = prefix.pad.shape
-        cache = self._make_cache(batch, (length, *room))
+        cache = self.backend.new_cache(self.network.paligemma_with_expert, batch, (length, *lengths))
         frame = self._frame([prefix.pad, None, None], Segment.PREFIX)
         self._run(Segment.PREFIX, prefix.embs, frame, cache, None, output=False)
         return Context(prefix.pad, cache)
 
-    def _make_cache(self, batch: int, lengths: tuple[int, int, int]) -> SegmentKVCache:
-        return self.network.paligemma_with_expert.make_cache(batch, lengths, self.device)
-
-    def prefill_geometry(self, context: Context, geometry: GeometryTokens | None) -> Tensor | None:
-        """Keys and values of geometry, if there is any, into the cache. Returns its mask."""
+    def prefill_geometry(self, context: Context, geometry: GeometryTokens | None) -> GeometryPass | None:
+        """Geometry's keys and values into the cache, unless they follow the flow time."""
         if geometry is None:
             return None
         segment = self.network.embed_geometry(*geometry)
-        assert segment.embs is not None
-        frame = self._frame([context.prefix_pad, segment.pad, None], Segment.GEOMETRY)
-        clean = self._schedule(Segment.GEOMETRY, 1)[0].layers
-        self._run(Segment.GEOMETRY, segment.embs, frame, context.cache, clean, output=False)
-        return segment.pad
+        given = GeometryPass(segment, self._frame([context.prefix_pad, segment.pad, None], Segment.GEOMETRY))
+        if not self.network.geometry_follows_time:
+            self._write_geometry(context, given, self._flow_times_of(Segment.GEOMETRY, (0.0,))[0])
+        return given
 
-    def denoise(self, context: Context, x_t: Tensor, geometry_pad: Tensor | None, num_steps: int) -> Tensor:
+    def denoise_suffix(
+        self,
+        context: Context,
+        x_t: Tensor,
+        geometry: GeometryPass | None,
+        previous: Guidance | HardPrefix | None,
+        settings: ChunkSettings,
+    ) -> Tensor:
         """Integrate the flow from noise x_t (B, S, D) over a filled cache."""
-        network, dt = self.network, -1.0 / num_steps
+        network, times = self.network, _step_times(settings.num_steps)
+        dt = -1.0 / settings.num_steps
         suffix_pad = torch.ones(x_t.shape[:2], dtype=torch.bool, device=x_t.device)
+        geometry_pad = None if geometry is None else geometry.segment.pad
         frame = self._frame([context.prefix_pad, geometry_pad, suffix_pad], Segment.SUFFIX)
-        for layers, last in self._schedule(Segment.SUFFIX, num_steps):
-            x = self._run(Segment.SUFFIX, network.action_in_proj(x_t), frame, context.cache, layers, output=True)
-            x_t = torch.add(x_t, network.action_out_proj(adaptive_norm(x, last)), alpha=dt)
-        return x_t
+        hard = previous if isinstance(previous, HardPrefix) else None
+        clean = None if hard is None else self._flow_times_of(Segment.SUFFIX, (0.0,))[0]
+        geometry_times = self._flow_times_of(Segment.GEOMETRY, times) if network.geometry_follows_time else None
+        for step, flow_time in enumerate(self._flow_times_of(Segment.SUFFIX, times)):
+            if geometry is not None and geometry_times is not None:
+                self._write_geometry(context, geometry, geometry_times[step])
+            if hard is not None and clean is not None:
+                x_t, flow_time = hard.impose(x_t), _by_token(hard.mask, clean, flow_time)
+            embs = network.action_in_proj(x_t)
+            x = self._run(Segment.SUFFIX, embs, frame, context.cache, flow_time, output=True)
+            velocity = network.action_out_proj(flow_time.of_norm(-1).norm(x))
+            if isinstance(previous, Guidance):
+                velocity = previous.correct(velocity, x_t, times[step], settings.max_guidance_weight)
+            x_t = torch.add(x_t, velocity, alpha=dt)
+        return x_t if hard is None else hard.impose(x_t)
+
+    def _write_geometry(self, context: Context, geometry: GeometryPass, flow_time: FlowTime) -> None:
+        assert geometry.segment.embs is not None
+        self._run(Segment.GEOMETRY, geometry.segment.embs, geometry.frame, context.cache, flow_time, output=False)
 
     def _run(
         self,
@@ -238,54 +262,78 @@ class ChunkRunner:
         embs: Tensor,
         frame: SegmentFrame,
         cache: SegmentKVCache,
-        modulations: Sequence[LayerModulation] | None,
+        flow_time: FlowTime | None,
         output: bool,
     ) -> Tensor:
         """Embeddings (B, N, W) of a segment through its layers, in the compute dtype."""
         x, layers = embs.to(self.config.dtype), self._layers[segment]
-        return run_layers(x, layers, self.config.expert, frame, cache, cache.span(segment), modulations, output)
+        return run_layers(x, layers, self.config.expert, frame, cache, cache.span(segment), flow_time, output)
 
-    # --- what is the same in every layer ------------------------------------------------------------------------------
+    # --- the same in every chunk --------------------------------------------------------------------------------------
+
+    def compute_flow_times(self, num_steps: int) -> None:
+        """Compute the modulations that a chunk of so many denoising steps needs, before it is recorded."""
+        network, times = self.network, _step_times(num_steps)
+        self._flow_times_of(Segment.SUFFIX, times)
+        if network.rtc_enabled and network.rtc_mode == "trained":
+            self._flow_times_of(Segment.SUFFIX, (0.0,))
+        if self.config.geometry is not None and not network.geometry_in_prefix:
+            self._flow_times_of(Segment.GEOMETRY, times if network.geometry_follows_time else (0.0,))
+
+    @torch.inference_mode(False)
+    @torch.no_grad()
+    def _flow_times_of(self, segment: Segment, times: tuple[float, ...]) -> list[FlowTime]:
+        """The modulations of a segment's norms at these T flow times."""
+        model = self._models[segment]
+        key = id(model), times
+        if key not in self._flow_times:
+            # Filled on the device, not copied from the host, which could not be recorded.
+            flow_times = torch.cat([torch.full((1,), time, device=self.device) for time in times])
+            cond = self.network.embed_time(flow_times)  # (T, W)
+            norms = [norm for x in model.layers for norm in (x.input_layernorm, x.post_attention_layernorm)]
+            given = torch.stack([norm.dense(cond) for norm in (*norms, model.norm)], dim=1)  # (T, norms, 3 W)
+            scale, shift, gate = Modulation.of(given)
+            gate = gate.to(self.config.dtype)
+            self._flow_times[key] = [FlowTime(*rows) for rows in zip(scale, shift, gate, strict=True)]
+        return self._flow_times[key]
+
+    # --- the same in every layer --------------------------------------------------------------------------------------
 
     def _frame(self, pads: list[Tensor | None], segment: Segment) -> SegmentFrame:
-        """Positions and masks of a segment. pads: (B, N) bool of all segments up to it, None for those that are not there."""
+        """Rotary tables and masks of a segment. pads: (B, N) bool of all segments up to it, None for absent ones."""
         rule = self.config.geometry.positions if self.config.geometry else "sequential"
         positions = segment_positions(pads, rule)[segment]
         assert positions is not None
         cos, sin = rotary_table(positions, self.config.expert.head_dim)
-        cos, sin = torch.cat([cos, cos], dim=-1), torch.cat([-sin, sin], dim=-1)
-        written_out = write_attention_out(self.kernels, self.config.dtype)
-        return SegmentFrame(cos[:, None], sin[:, None], self._masks(segment, pads), written_out)
+        return SegmentFrame(cos, sin, self._masks(segment, pads), self.backend.attention_in_products(self.config.dtype))
 
-    def _masks(self, segment: Segment, pads: Sequence[Tensor | None]) -> list[Tensor | None]:
-        """Additive masks of a segment, per layer."""
-        atts = [None if pad is None else one_block(pad.shape[1]) for pad in pads]
-        seen = segment_mask(segment, pads, atts)  # (B, 1, K)
-        depth, geometry_pad = self.config.expert.depth, pads[Segment.GEOMETRY]
-        gate = self.network.paligemma_with_expert.geometry_gate
-        # A float32 mask keeps the gate's digits; CUDA has no fast kernel for one beside bf16 queries.
-        dtype = torch.float32 if self.kernels == "cpu" else self.config.dtype
-        hidden = torch.zeros(seen.shape, dtype=dtype, device=seen.device).masked_fill(~seen, torch.finfo(dtype).min)
-        hidden = hidden[:, None]  # (B, 1, 1, K)
-        if segment is Segment.SUFFIX and gate is not None and geometry_pad is not None:
-            suffix = pads[Segment.SUFFIX]
-            assert suffix is not None
-            queries, start = suffix.shape[1], seen.shape[2] - suffix.shape[1] - geometry_pad.shape[1]
-            heads = self.config.expert.num_kv_heads
-            masks: list[Tensor | None] = []
-            for layer in range(depth):
-                bias = gate(layer, start, geometry_pad.shape[1], queries).to(dtype)  # (H, K)
-                rows = bias.unflatten(0, (heads, -1))[:, :, None].expand(-1, -1, queries, -1).flatten(1, 2)
-                masks.append(hidden + rows)
-            return masks
-        return [None if self._may_look and bool(seen.all()) else hidden] * depth
+    def _masks(self, segment: Segment, pads: Sequence[Tensor | None]) -> list[Tensor]:
+        """Additive masks of a segment's folded queries, per layer: (B, 1, 1, K), or with the gate (B, KV, H / KV * N, K)."""
+        seen = segment_mask(segment, pads, [None if pad is None else one_block(pad.shape[1]) for pad in pads])
+        expert, gate = self.config.expert, self.network.paligemma_with_expert.geometry_gate
+        dtype = self.backend.mask_dtype(self.config.dtype)
+        prefix, geometry, suffix = (0 if pad is None else pad.shape[1] for pad in pads)
+        if segment is not Segment.SUFFIX or gate is None or not geometry:
+            return [logit_bias(seen, None, dtype)] * expert.depth
+        masks = []
+        for layer in range(expert.depth):
+            bias = logit_bias(seen, gate(layer, prefix, geometry, suffix), dtype)  # (B, H, 1, K)
+            rows = bias.expand(-1, -1, suffix, -1).unflatten(1, (expert.num_kv_heads, -1))
+            masks.append(rows.flatten(2, 3))
+        return masks
 
-    @property
-    def kernels(self) -> str:
-        """Type of the device whose kernels decide how things are computed."""
-        return self.device.type
 
-    @property
-    def _may_look(self) -> bool:
-        """Whether values may be looked at: on a GPU, to look is to wait."""
-        return self.device.type == "cpu"
+def _step_times(num_steps: int) -> tuple[float, ...]:
+    """Flow time of every denoising step, from 1 downwards."""
+    return tuple(1.0 - step / num_steps for step in range(num_steps))
+
+
+def _by_token(mask: Tensor, clean: FlowTime, now: FlowTime) -> FlowTime:
+    """Modulations per token (norms, N, W): `clean` where the mask (N,) is True, else `now`."""
+    where = mask[:, None]
+    return FlowTime(*(torch.where(where, a[:, None], b[:, None]) for a, b in zip(clean, now, strict=True)))
+
+
+def observation_key(*inputs: Any) -> tuple:
+    """Shapes and dtypes of the tensors among `inputs`, which are leaves."""
+    return tuple((x.shape, x.dtype) if isinstance(x, Tensor) else None for x in inputs)

@@ -1,119 +1,165 @@
-"""Which way a chunk is computed: by the runner, or by the plain path where the runner is not wanted or does not apply."""
+"""How a chunk is computed: by the runner, or by the plain path where the runner is not wanted or not able."""
 
+import inspect
 import logging
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..model.config import RunnerName
 from ..model.pi05 import PI05Pytorch
+from .backend import Backend
 from .cuda_graphs import PROMPT_STEP, GraphRunner
-from .fused_weights import NotPlainError
-from .layers import write_attention_out
-from .runner import ChunkRunner, why_not
+from .fused_weights import UnsupportedLayerError
+from .runner import ChunkRunner
 from .side_stream import PendingGeometry
 
 logger = logging.getLogger(__name__)
 
-_KNOWN_TO_RUNNER = {"noise", "num_steps", "geom_embs", "geom_pad", "geometry"}
+RUNNER_ARGUMENTS = frozenset(inspect.signature(ChunkRunner.__call__).parameters) - {"self"}
+# Arguments of the plain path that the runner does not take, and why.
+PLAIN_ONLY = {
+    "use_cache": "use_cache=False is the slow reference",
+    "geom_att": "geom_att makes blocks inside the geometry segment, which no policy does",
+}
 
 
-class ChunkSampler:
-    """Samples action chunks from a network. The plain path is always there; a fallback to it is reported, once."""
+class ChunkSampler(nn.Module):
+    """Samples action chunks from a network. Reports once when it falls back to the plain path.
 
-    def __init__(self, network: PI05Pytorch) -> None:
-        self._network = network
+    The runner holds copies of weights, modulations and recorded graphs. It is built at the first chunk in evaluation mode, and
+    dropped with all that it holds
+
+    - when training begins, when weights are loaded, and when the network moves or changes its dtype. The sampler is a module
+      without parameters, so that PyTorch tells it: a policy owns it beside the network.
+    - when a chunk is asked for after a module or parameter was replaced, or after a write that PyTorch counted.
+    - by `refresh()`. Call it after a write that PyTorch does not count: through `parameter.data`, or by a fused optimiser while
+      the network stayed in evaluation mode.
+
+    network: not a submodule of the sampler. backend: makes what the runner has to know of a device.
+    """
+
+    def __init__(self, network: PI05Pytorch, backend: Callable[[torch.device], Backend] = Backend) -> None:
+        super().__init__()
+        self._networks = (network,)  # in a tuple, so that its parameters are not the sampler's
+        self._make_backend = backend
         self._runners: dict[type[ChunkRunner], ChunkRunner] = {}
-        self._declined: str | None = None
+        self._reported: str | None = None
 
     def __reduce__(self) -> tuple:
-        """A copy builds its own runner: recorded graphs have no copies."""
-        return ChunkSampler, (self._network,)
+        """A copy builds its own runner: recorded graphs cannot be copied."""
+        return ChunkSampler, (self._network, self._make_backend)
 
-    def __call__(self, *observation: Any, runner: RunnerName = "fast", **kwargs: Any) -> Tensor:
-        """An action chunk (B, S, D); observation and kwargs as in `ChunkRunner.sample` or `PI05Pytorch.sample_actions`."""
-        given = {name: value for name, value in kwargs.items() if value is not None}
-        if runner == "plain":
-            return self._plainly(*observation, **given)
-        declined = self._why_not(runner, set(given))
-        if declined is not None:
-            if declined != self._declined:
-                logger.warning("The plain path computes the actions, since %s.", declined)
-            self._declined = declined
-            return self._plainly(*observation, **given)
-        self._declined = None
-        return self._runners[self._class(runner)].sample(*observation, **given)
-
-    def _plainly(self, *observation: Any, geometry: PendingGeometry | None = None, **given: Any) -> Tensor:
-        if geometry is not None:
-            given["geom_embs"], given["geom_pad"] = geometry.measure()
-        return self._network.sample_actions(*observation, **given)
+    @property
+    def _network(self) -> PI05Pytorch:
+        return self._networks[0]
 
     @property
     def _device(self) -> torch.device:
         return self._network.action_in_proj.weight.device
 
-    def _class(self, runner: RunnerName) -> type[ChunkRunner]:
-        return GraphRunner if runner == "fast" and self._device.type == "cuda" else ChunkRunner
+    # --- when a runner is dropped ---------------------------------------------------------------------------------------
 
-    def _why_not(self, runner: RunnerName, given: set[str]) -> str | None:
-        """Why the runner cannot serve this call; builds it if it can."""
-        network = self._network
-        if network.rtc_processor is not None and network.rtc_processor.rtc_config.enabled:
-            return "real-time chunking guides every step"
-        unknown = given - _KNOWN_TO_RUNNER
-        if unknown:
-            return f"the runner does not know {', '.join(sorted(unknown))}"
-        reason = why_not(network)
+    def refresh(self) -> None:
+        """Drop the runner; the next chunk builds a new one from the weights as they are then."""
+        self._runners.clear()
+
+    def train(self, mode: bool = True) -> "ChunkSampler":
+        if mode:
+            self.refresh()
+        return super().train(mode)
+
+    def _apply(self, *args: Any, **kwargs: Any) -> "ChunkSampler":  # PyTorch moves and casts modules by it
+        self.refresh()
+        return super()._apply(*args, **kwargs)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        self.refresh()
+        super()._load_from_state_dict(*args, **kwargs)
+
+    # --- a chunk --------------------------------------------------------------------------------------------------------
+
+    def forward(self, *observation: Any, runner: RunnerName = "fast", **kwargs: Any) -> Tensor:
+        """An action chunk (B, S, D); arguments as in `ChunkRunner.__call__` or `PI05Pytorch.sample_actions`."""
+        given = {name: value for name, value in kwargs.items() if value is not None}
+        if runner == "plain":
+            return self._plain(*observation, **given)
+        reason = self._unsupported_reason(runner, set(given))
         if reason is not None:
-            return reason
-        wanted = self._class(runner)
-        # One that was built where the network is no longer would keep that device's memory.
-        self._runners = {kind: built for kind, built in self._runners.items() if built.device == self._device}
-        try:
-            if wanted not in self._runners:
-                self._runners[wanted] = self._make_runner(wanted)
-            self._runners[wanted].refresh()
-        except NotPlainError as error:
-            self._runners.clear()
-            return str(error)
+            if reason != self._reported:
+                logger.warning("The plain path computes the actions, since %s.", reason)
+            self._reported = reason
+            return self._plain(*observation, **given)
+        self._reported = None
+        return self._runners[self._kind(runner)](*observation, **given)
+
+    def _plain(self, *observation: Any, geometry: PendingGeometry | None = None, **given: Any) -> Tensor:
+        if geometry is not None:
+            given["geom_embs"], given["geom_pad"] = geometry.measure()
+        return self._network.sample_actions(*observation, **given)
+
+    def _kind(self, runner: RunnerName) -> type[ChunkRunner]:
+        return GraphRunner if runner == "fast" and self._make_backend(self._device).can_record else ChunkRunner
+
+    def prepare(self, runner: RunnerName = "fast") -> str | None:
+        """Build the runner and its modulations, if they are not there. Returns why the plain path serves instead, or None."""
+        reason = self._unsupported_reason(runner, set())
+        if reason is None:
+            self._runners[self._kind(runner)].compute_flow_times(self._network.config.num_inference_steps)
+        return reason
+
+    def _unsupported_reason(self, runner: RunnerName, given: set[str]) -> str | None:
+        """Why the runner cannot compute this chunk, as the rest of a sentence; if it can, None, and the runner is there."""
+        rtc = self._network.rtc_processor
+        if self._network.rtc_enabled and rtc.is_debug_enabled():
+            return "rtc_config.debug records every denoising step"
+        if self._network.training:
+            return "the network is in training mode"
+        for name in sorted(given - RUNNER_ARGUMENTS):
+            return PLAIN_ONLY.get(name, f"the runner does not know the argument {name}")
+        kind = self._kind(runner)
+        if not all(built.is_current() for built in self._runners.values()):
+            self.refresh()
+        if kind not in self._runners:
+            try:
+                self._runners[kind] = kind(self._network, self._make_backend(self._device))
+            except UnsupportedLayerError as error:
+                return str(error)
         return None
 
-    def _make_runner(self, kind: type[ChunkRunner]) -> ChunkRunner:
-        return kind(self._network)
+    # --- for a person ---------------------------------------------------------------------------------------------------
 
     def tensors(self) -> list[Tensor]:
-        """All that is kept between chunks; some of it is the network's own storage (fused_weights.py)."""
+        """The tensors that outlive a chunk; some of them are the network's own storage (fused_weights.py)."""
         return [tensor for runner in self._runners.values() for tensor in runner.tensors()]
 
     def explain(self, runner: RunnerName = "fast") -> dict[str, str]:
         """What is active and what was declined, and why, for a person to read. runner: the one that is asked for."""
         if runner == "plain":
             return {"runner": "declined: inference_runner=plain; the plain path serves"}
-        reason = self._why_not(runner, set())
+        reason = self._unsupported_reason(runner, set())
         if reason is not None:
             return {"runner": f"declined: {reason}; the plain path serves"}
-        network = self._network
+        network, active = self._network, self._runners[self._kind(runner)]
         shared = all(
             layer.self_attn.q_proj.weight.dtype == network.config.dtype
             for layer in network.paligemma_with_expert.expert.layers
         )
-        written_out = write_attention_out(self._device.type, network.config.dtype)
         return {
             "runner": "active",
             "matrices": "joined (q, k, v; gate, up), "
-            + (
-                "in the network's own storage" if shared else "copies in the compute dtype, compared before every chunk"
-            ),
-            "flow time": "modulations of all denoising steps computed at once, "
-            + ("until weights change" if self._device.type == "cpu" else "in every chunk"),
-            "attention": "written-out products (measured: faster on a CPU in bf16)" if written_out else "SDPA",
+            + ("in the network's own storage" if shared else "copies in the compute dtype until weights change"),
+            "flow time": "modulations of all denoising steps computed once, until weights change",
+            "attention": "written-out products (measured: faster on a CPU in bf16)"
+            if active.backend.attention_in_products(network.config.dtype)
+            else "SDPA",
             "last VLM layer": "stops at keys and values",
             "cameras": "one vision batch, absent ones not encoded",
             "geometry": self._explain_geometry(),
-            "real-time chunking": "declined: the plain path serves it",
-            **self._explain_graphs(runner),
+            "real-time chunking": f"active: {network.rtc_mode}" if network.rtc_enabled else "off",
+            **self._explain_graphs(active),
             "compilation": "left out: on a CPU it gains less than it costs (docs/results.md); on a GPU it has not been measured",
         }
 
@@ -126,10 +172,9 @@ class ChunkSampler:
             return "measured on a side stream, beside vision and prefix"
         return f"measured after the prefix: a {self._device.type} has no streams"
 
-    def _explain_graphs(self, runner: RunnerName) -> dict[str, str]:
-        active = self._runners[self._class(runner)]
+    def _explain_graphs(self, active: ChunkRunner) -> dict[str, str]:
         if isinstance(active, GraphRunner):
             state = f"active: {len(active.recorded)} of at most {active.capacity} shapes of inputs recorded"
             return {"CUDA graphs": state, "prompt": f"padded to a multiple of {PROMPT_STEP} tokens, one graph each"}
-        why = "inference_runner=eager" if self._device.type == "cuda" else f"a {self._device.type} has none"
+        why = "inference_runner=eager" if active.backend.can_record else f"a {self._device.type} has none"
         return {"CUDA graphs": f"declined: {why}", "prompt": "as long as the longest of the batch"}

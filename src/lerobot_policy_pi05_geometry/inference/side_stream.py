@@ -1,4 +1,4 @@
-"""Geometry that is measured while the GPU looks at the images: on a stream of its own.
+"""Geometry that is measured while the GPU computes the prefix, on a stream of its own.
 
 ```
    main stream    ──► vision ─► prefix ──────────┬─► geometry segment ─► denoising
@@ -16,36 +16,36 @@ from ..model.segments import GeometryTokens
 
 
 class PendingGeometry(NamedTuple):
-    """Geometry that has yet to be measured, by a function that is called once. num_tokens: G, known before."""
+    """Geometry that has not been measured yet. measure: called once. num_tokens: G, known before."""
 
     num_tokens: int
     measure: Callable[[], GeometryTokens]
 
     @classmethod
     def given(cls, embs: Tensor, pad: Tensor | None) -> "PendingGeometry":
-        """Geometry that is there already; without `pad` every token counts."""
+        """Geometry that has been measured; without `pad` every token counts."""
         if pad is None:
             pad = torch.ones(embs.shape[:2], dtype=torch.bool, device=embs.device)
         return cls(embs.shape[1], lambda: GeometryTokens(embs, pad))
 
 
 class SideStream:
-    """Runs work beside what the main stream is busy with. Where there are no streams, on a CPU, it just runs it."""
+    """Runs work beside the main stream's. On a CPU, which has no streams, it runs it at once."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
 
     def begin_here(self) -> None:
-        """What runs on the side waits for what the main stream was given until now, and for nothing that comes later."""
+        """Later work on the side waits for all work that the main stream was given before this call."""
         if self._stream is not None:
             self._stream.wait_stream(torch.cuda.current_stream(self._device))
 
     def run[T](self, work: Callable[[], T]) -> T:
         """The result of `work`, launched on the side; the main stream waits for it, the host does not.
 
-        Memory needs no bookkeeping: what `work` allocates is used again by later work on the side only, which waits for the
-        main stream by `begin_here`.
+        The memory of `work` needs no bookkeeping: only later work on the side reuses it, and that waits for the main stream
+        by `begin_here`.
         """
         if self._stream is None:
             return work()

@@ -15,7 +15,7 @@ from ..checkpoint.load import LoadedPolicy
 from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..data.images import prepare_images
 from ..geometry.keys import CALIBRATION_PREFIX, DEPTH_SUFFIX, IMAGE_PREFIX, extrinsics_key
-from ..inference.runner import ChunkRunner, Observation
+from ..inference.runner import ChunkRunner, ChunkSettings, Observation
 from ..model.segments import GeometryTokens
 
 PARTS = ("prompt and state", "geometry features", "vision and text", "prefix", "geometry", "denoising", "actions out")
@@ -112,7 +112,7 @@ def _parts(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int, devic
     def embed(batch: dict[str, Any], tokens: GeometryTokens | None) -> Any:
         images, masks = prepare_images(batch, config, torch.device(device))
         text = (batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK])
-        return runner.embed(Observation(images, masks, *text), tokens if in_prefix else None)
+        return runner.embed_prefix(Observation(images, masks, *text), tokens if in_prefix else None)
 
     width = config.action_feature.shape[0]
     for _ in range(rounds + 2):
@@ -120,10 +120,11 @@ def _parts(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int, devic
         tokens = step("geometry features", partial(measure, batch))
         prefix = step("vision and text", partial(embed, batch, tokens))
         own = None if in_prefix else tokens  # a segment of its own
-        room = (0 if own is None else own.pad.shape[1], config.chunk_size)
-        context = step("prefix", partial(runner.prefill, prefix, room))
-        pad = step("geometry", partial(runner.prefill_geometry, context, own))
-        actions = step("denoising", partial(runner.denoise, context, noise, pad, config.num_inference_steps))
+        lengths = (0 if own is None else own.pad.shape[1], config.chunk_size)
+        settings = ChunkSettings(lengths[0], lengths, config.num_inference_steps, 0.0)
+        context = step("prefix", partial(runner.prefill_prefix, prefix, lengths))
+        segment = step("geometry", partial(runner.prefill_geometry, context, own))
+        actions = step("denoising", partial(runner.denoise_suffix, context, noise, segment, None, settings))
         step("actions out", partial(loaded.postprocess, actions[:, 0, :width]))
     return {part: _timing(values[2:]) for part, values in times.items()}
 

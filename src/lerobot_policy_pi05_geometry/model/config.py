@@ -1,4 +1,4 @@
-"""What the network has to be told, and nothing else."""
+"""Settings of the network."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -11,7 +11,8 @@ GeometryTime = Literal["clean", "denoise"]
 GeometryPositions = Literal["sequential", "parallel"]
 GeometryPlacement = Literal["segment", "prefix"]
 GeometryExpert = Literal["shared", "own"]
-RunnerName = Literal["fast", "eager", "plain"]  # the runner, on a GPU as CUDA graphs; the runner without; the reference
+RunnerName = Literal["fast", "eager", "plain"]  # the runner, on a GPU as CUDA graphs; without graphs; the plain path
+RtcMode = Literal["guided", "trained"]  # real-time chunking, see real_time_chunking.py
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class NetworkConfig:
 
     dtype: compute dtype. param_dtype: storage dtype of everything that `precision.py` does not keep in float32.
     geometry: None builds plain π0.5.
+    rtc_training_max_delay: action steps of the longest hard prefix in training; 0 for none (real_time_chunking.py).
     """
 
     paligemma: PaliGemmaVariant
@@ -52,6 +54,7 @@ class NetworkConfig:
     dtype: torch.dtype = torch.float32
     param_dtype: torch.dtype = torch.float32
     geometry: GeometrySegmentConfig | None = None
+    rtc_training_max_delay: int = 0
 
     def __post_init__(self) -> None:
         vlm = self.paligemma.gemma

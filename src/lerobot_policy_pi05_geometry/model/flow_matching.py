@@ -24,6 +24,7 @@ class FlowDraw(NamedTuple):
     time: Tensor  # (B,) float32 in (0, 1]; (B, K)
     dropout: Tensor  # (B,) float32, uniform in [0, 1): what the sample goes without (dropout.py)
     camera: Tensor  # (B,) float32, uniform in [0, 1): which camera, if it goes without one
+    delay: Tensor  # (B,) int64 in [0, max_delay]: action steps of the hard prefix (real_time_chunking.py)
 
 
 def draw_flow(
@@ -37,13 +38,17 @@ def draw_flow(
     scale: float,
     offset: float,
     samples: int = 1,
+    max_delay: int = 0,
 ) -> FlowDraw:
-    """Draw noise, flow time Beta(alpha, beta) * scale + offset, and two uniform numbers for each dataset index.
+    """Draw noise, flow time Beta(alpha, beta) * scale + offset, two uniform numbers and a delay for each dataset index.
 
     seed: of the run. step: optimiser steps done so far. indices: dataset index of each of the B samples.
-    shape: (S, D) of one action chunk. samples: K, noises and times per observation. Returns a `FlowDraw`.
+    shape: (S, D) of one action chunk. samples: K, noises and times per observation. max_delay: of the hard prefix.
+    Returns a `FlowDraw`.
     """
-    noise, time, dropout, camera = [], [], [], []
+    noise: list[np.ndarray] = []
+    time: list[np.ndarray] = []
+    dropout, camera, delay = [], [], []
     for index in indices:
         generator = np.random.Generator(
             np.random.Philox(
@@ -55,7 +60,14 @@ def draw_flow(
         time.append(generator.beta(alpha, beta, samples) * scale + offset)
         dropout.append(generator.random())
         camera.append(generator.random())
+        delay.append(generator.integers(0, max_delay, endpoint=True))
     noises, times = torch.from_numpy(np.stack(noise)), torch.from_numpy(np.stack(time)).float()
     if samples == 1:
         noises, times = noises[:, 0], times[:, 0]
-    return FlowDraw(noises, times, *(torch.tensor(drawn, dtype=torch.float32) for drawn in (dropout, camera)))
+    return FlowDraw(
+        noises,
+        times,
+        torch.tensor(dropout, dtype=torch.float32),
+        torch.tensor(camera, dtype=torch.float32),
+        torch.tensor(delay),
+    )

@@ -1,8 +1,8 @@
 """One Gemma transformer layer of one segment: the same code trains, prefills and denoises.
 
 A segment sees whole earlier segments and itself, never a later one. So a layer runs segment by segment: each computes
-its own queries, keys and values, attends to the keys that the earlier segments left behind plus its own, and hands
-both on. Whether "left behind" means a concatenation (training) or a preallocated cache (inference) is one line.
+its own queries, keys and values, attends to the keys of the earlier segments and its own, and returns both. The keys of
+earlier segments are concatenated in training and read from a preallocated cache at inference.
 
 Parameter names are those of LeRobot's π0.5. Shapes: B batch, N tokens of the segment, W width, H heads, KV key/value
 heads, D head_dim, K keys up to the segment's end.
@@ -17,11 +17,10 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from .attention import Attention, apply_rotary
-from .precision import Float32Linear, Float32Module
+from .norms import AdaRMSNorm, add_residual, make_norm
+from .precision import Float32Linear
 from .segment_cache import CacheSlot
 from .variants import GemmaVariant
-
-RMS_EPS = 1e-6
 
 
 class KeysValues(NamedTuple):
@@ -29,52 +28,6 @@ class KeysValues(NamedTuple):
 
     keys: Tensor
     values: Tensor
-
-
-class RMSNorm(Float32Module):
-    """x / rms(x) * (1 + weight), computed in float32, returned in x's dtype, with no residual gate."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.weight = nn.Parameter(torch.zeros(width))
-
-    def forward(self, x: Tensor, cond: Tensor | None = None) -> tuple[Tensor, None]:
-        """x (B, N, W) -> (B, N, W) and None."""
-        return (_normalise(x) * (1.0 + self.weight)).to(x.dtype), None
-
-
-class AdaRMSNorm(nn.Module):
-    """RMSNorm whose scale, shift and residual gate come from the flow time (adaRMS, π0.5)."""
-
-    def __init__(self, width: int, cond_dim: int) -> None:
-        super().__init__()
-        self.dense = Float32Linear(cond_dim, 3 * width)
-        nn.init.zeros_(self.dense.weight)
-
-    def forward(self, x: Tensor, cond: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Modulate x (B, N, W) by cond, (B or 1, cond_dim) float32, or (B, K, cond_dim) for K samples of N / K tokens.
-
-        Returns (B, N, W) and the residual gate, (B or 1, 1, W) or (B, N, W), both in x's dtype.
-        """
-        if cond is None:
-            raise ValueError("An adaptive norm needs `adarms_cond`, the embedded flow time of its segment.")
-        modulation = self.dense(cond)
-        if cond.ndim == 2:
-            modulation = modulation[:, None]
-        else:
-            modulation = modulation.repeat_interleave(x.shape[1] // cond.shape[1], dim=1)
-        scale, shift, gate = modulation.chunk(3, dim=-1)
-        return (_normalise(x) * (1.0 + scale) + shift).to(x.dtype), gate.to(x.dtype)
-
-
-def _normalise(x: Tensor) -> Tensor:
-    x = x.float()
-    return x * torch.rsqrt(x.square().mean(dim=-1, keepdim=True) + RMS_EPS)
-
-
-def _add(residual: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
-    update = update.to(residual.dtype)
-    return residual + (update if gate is None else update * gate)
 
 
 class GemmaAttention(nn.Module):
@@ -131,10 +84,10 @@ class GemmaLayer(nn.Module):
     ) -> tuple[Tensor | None, KeysValues]:
         """Run the segment through the layer.
 
-        x (B, N, W); rotary cos and sin (B, N, D/2); mask (B, 1 or N, K) bool; cond as in `AdaRMSNorm`;
+        x (B, N, W); rotary as `rotary_table` gives it; mask (B, 1 or N, K) bool; cond as in `AdaRMSNorm`;
         bias (H, K) float32; earlier: keys and values of the earlier segments, where there is no cache; slot: the
-        segment's place in the cache; output=False stops after the keys and values, which is all that the last layer
-        of prefix and geometry is needed for.
+        segment's slot in the cache; output=False stops after the keys and values, since nothing reads the output of the
+        last layer of prefix and geometry.
 
         Returns the hidden states (B, N, W) or None, and the keys and values up to the segment's end.
         """
@@ -153,14 +106,9 @@ class GemmaLayer(nn.Module):
 
         queries = apply_rotary(attn.heads(attn.q_proj(normed)), *rotary)
         attended = attn.attention(queries, seen.keys, seen.values, mask, bias)  # (B, H, N, D)
-        x = _add(x, attn.o_proj(attended.transpose(1, 2).flatten(2)), gate)
+        x = add_residual(x, attn.o_proj(attended.transpose(1, 2).flatten(2)), gate)
         normed, gate = self.post_attention_layernorm(x, cond)
-        return _add(x, self.mlp(normed), gate), seen
-
-
-def make_norm(width: int, cond_dim: int | None) -> RMSNorm | AdaRMSNorm:
-    """The plain norm of the VLM, or the adaptive one of an expert."""
-    return RMSNorm(width) if cond_dim is None else AdaRMSNorm(width, cond_dim)
+        return add_residual(x, self.mlp(normed), gate), seen
 
 
 class GemmaModel(nn.Module):
@@ -185,22 +133,22 @@ class GemmaModel(nn.Module):
         return embeddings * torch.tensor(self.variant.width**0.5, dtype=embeddings.dtype)
 
     @torch.no_grad()
-    def start_numbers_in_order(self, ids: Sequence[int]) -> None:
-        """Let the embeddings of the tokens 0, 1, 2, ... start as sines and cosines of the number, at the usual scale.
+    def initialise_number_embeddings(self, ids: Sequence[int]) -> None:
+        """Set the embeddings of the tokens 0, 1, 2, ... to sines and cosines of the number, at the scale of the others.
 
-        A pretrained VLM knows that 12 lies between 11 and 13. One from scratch has to learn it for every number apart,
-        and the state is written in numbers.
+        ids: token id of each number. A pretrained VLM knows that 12 lies between 11 and 13. A VLM from scratch has to learn
+        this for each number separately, and π0.5 writes the state into the prompt as numbers.
         """
         numbers, width = len(ids), self.variant.width
-        periods = 2 * numbers / 2 ** torch.linspace(0, 6, width // 2)  # from twice the range down to its 32nd part
+        periods = 2 * numbers / 2 ** torch.linspace(0, 6, width // 2)  # from twice the range to a 32nd of it
         angles = 2 * math.pi * torch.arange(numbers)[:, None] / periods
         waves = torch.cat([angles.sin(), angles.cos()], dim=1) * (2 / width) ** 0.5  # each row has length 1
         self.embed_tokens.weight[torch.tensor(ids)] = waves.to(self.embed_tokens.weight)
 
     def freeze_unread_output(self) -> None:
-        """Freeze what feeds nothing when only keys and values of the last layer are read.
+        """Freeze the parameters that nothing reads when only the keys and values of the last layer are used.
 
-        These weights load and save like any other; without a gradient they would fail DDP.
+        They load and save like all others. As trainable parameters without a gradient they would make DDP fail.
         """
         last = self.layers[-1]
         for module in (

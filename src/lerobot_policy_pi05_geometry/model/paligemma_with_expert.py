@@ -43,7 +43,7 @@ class PaliGemmaModel(nn.Module):
 
 
 class Holder[T: nn.Module](nn.Module):
-    """Gives its content the name `model`, as the released checkpoints have it."""
+    """Names its content `model`, as in the released checkpoints."""
 
     model: T
 
@@ -133,8 +133,8 @@ class PaliGemmaWithExpert(nn.Module):
         π0.5. An entry of `inputs_embeds` that is None is a segment whose keys and values are already in the cache, or
         that is absent.
 
-        attention_mask: (B, 1 or Q_i, K_i) bool per given segment (`layout.segment_mask`).
-        position_ids: (B, N_i) per given segment (`layout.segment_positions`).
+        attention_mask: (B, 1 or Q_i, K_i) bool per given segment (`segment_mask.segment_mask`).
+        position_ids: (B, N_i) per given segment (`segments.segment_positions`).
         past_key_values: cache to write to and read from; needs `use_cache=True`.
         inputs_embeds: (B, N_i, W_i) per segment.
         adarms_cond: embedded flow time (B or 1, W_expert) float32 for geometry and suffix.

@@ -13,9 +13,10 @@ from lerobot.policies.common.flow_matching import euler_integrate
 from lerobot.utils.device_utils import get_safe_dtype
 from torch import Tensor, nn
 
-from .config import NetworkConfig
+from .config import NetworkConfig, RtcMode
 from .paligemma_with_expert import PaliGemmaWithExpert
 from .precision import Float32Linear, compute_in
+from .real_time_chunking import HardPrefix, make_hard_prefix, require_delay
 from .segment_cache import SegmentKVCache
 from .segment_mask import segment_mask
 from .segments import AttMasks, Segment, SegmentTokens, one_block, segment_positions
@@ -28,6 +29,7 @@ class PI05Pytorch(nn.Module):
         super().__init__()
         self.config = config
         self.rtc_processor = rtc_processor
+        self.rtc_mode: RtcMode = "guided"
         width = config.expert.width
         self.paligemma_with_expert = PaliGemmaWithExpert(config)
         self.action_in_proj = Float32Linear(config.max_action_dim, width)
@@ -39,6 +41,11 @@ class PI05Pytorch(nn.Module):
     def geometry_width(self) -> int:
         """Width that geometry tokens must have: the expert's, or the VLM's if they stand in its prefix."""
         return self.config.paligemma.gemma.width if self.geometry_in_prefix else self.config.expert.width
+
+    @property
+    def rtc_enabled(self) -> bool:
+        """Whether chunks continue the previous one."""
+        return self.rtc_processor is not None and self.rtc_processor.rtc_config.enabled
 
     @property
     def geometry_in_prefix(self) -> bool:
@@ -76,17 +83,23 @@ class PI05Pytorch(nn.Module):
         return SegmentTokens(_silence(embedded, pad), pad, [0] * pad.shape[1])
 
     def embed_time(self, timestep: Tensor) -> Tensor:
-        """Flow time (B,) -> adaRMS condition (B, W) float32: sine-cosine embedding, in float64 where there is one, and an MLP."""
+        """Flow time (...) -> adaRMS condition (..., W) float32: sine-cosine embedding and an MLP.
+
+        The embedding is computed in float64 where the device has it.
+        """
         width = self.action_in_proj.out_features
         dtype = get_safe_dtype(torch.float64, timestep.device.type)
         exponent = torch.linspace(0.0, 1.0, width // 2, dtype=dtype, device=timestep.device)
         period = self.config.min_period * (self.config.max_period / self.config.min_period) ** exponent
-        angle = timestep[:, None].to(dtype) * (2 * math.pi / period)
-        embedded = torch.cat([angle.sin(), angle.cos()], dim=1).float()
+        angle = timestep[..., None].to(dtype) * (2 * math.pi / period)
+        embedded = torch.cat([angle.sin(), angle.cos()], dim=-1).float()
         return F.silu(self.time_mlp_out(F.silu(self.time_mlp_in(embedded))))
 
     def embed_suffix(self, noisy_actions: Tensor, timestep: Tensor) -> tuple[Tensor, Tensor, AttMasks, Tensor]:
-        """Noisy actions (B, S, D) and flow time (B,) -> embeddings (B, S, W), mask (B, S), att_masks, adaRMS condition."""
+        """Noisy actions (B, S, D) and flow time -> embeddings (B, S, W), mask (B, S), att_masks, adaRMS condition.
+
+        timestep: (B,), or (B, K) for K groups of S / K steps, so one per step for K = S. The condition: (B, W) or (B, K, W).
+        """
         embs = self.action_in_proj(noisy_actions)
         pad = torch.ones(embs.shape[:2], dtype=torch.bool, device=embs.device)
         return embs, pad, one_block(embs.shape[1]), self.embed_time(timestep)
@@ -103,29 +116,33 @@ class PI05Pytorch(nn.Module):
         geom_embs: Tensor | None = None,
         geom_pad: Tensor | None = None,
         geom_att: AttMasks | None = None,
+        delay: Tensor | None = None,
     ) -> Tensor:
         """Flow-matching loss of every action entry, unreduced, in the shape of `noise`, float32.
 
         actions: (B, S, D). noise: (B, S, D) and time: (B,), or (B, K, S, D) and (B, K): K flow samples of the same
         observation share one pass over prefix and geometry, blind to each other and all at the same positions.
         geom_embs: (B, G, W) tokens of the geometry adapter, geom_pad: (B, G) bool, False for a hole, geom_att: G
-        entries, one block by default. The rest as in `embed_prefix`.
+        entries, one block by default. delay: (B,) int64, the first steps that are given clean, at flow time 0, as in trained RTC;
+        their entries of the result are no loss. The rest as in `embed_prefix`.
         """
         samples = noise.shape[1] if noise.ndim == 4 else 1
-        # Every flow time has a geometry of its own: nothing to share.
-        if noise.ndim == 4 and self._geometry_follows_time:
-            observation, geometry_given = (images, img_masks, tokens, masks), (geom_embs, geom_pad, geom_att)
+        # Every flow time has a geometry of its own, so the samples cannot share it.
+        if noise.ndim == 4 and self.geometry_follows_time:
+            observation, others = (images, img_masks, tokens, masks), (geom_embs, geom_pad, geom_att, delay)
             flow = zip(noise.unbind(1), time.unbind(1), strict=True)
-            return torch.stack([self.forward(*observation, actions, n, t, *geometry_given) for n, t in flow], dim=1)
-        t = time[..., None, None]
+            return torch.stack([self.forward(*observation, actions, n, t, *others) for n, t in flow], dim=1)
+        step_time = time if delay is None else _time_per_step(time, noise.shape[-2], delay)  # (B[, K][, S])
+        t = step_time[..., None, None] if delay is None else step_time[..., None]
         clean = actions if noise.ndim == 3 else actions[:, None]
         with compute_in(self.config.dtype, tokens.device):
             prefix, geometry = self._context(images, img_masks, tokens, masks, geom_embs, geom_pad, geom_att)
             x_t = t * noise + (1 - t) * clean
-            embs, pad, att, cond = self.embed_suffix(x_t.flatten(1, -2), time.flatten())
-            if noise.ndim == 4:
-                cond = cond.unflatten(0, time.shape)  # (B, K, W)
-            output, _ = self._run([prefix, geometry, SegmentTokens(embs, pad, att)], cond, samples=samples)
+            embs, pad, att, cond = self.embed_suffix(
+                x_t.flatten(1, -2), step_time if step_time.ndim == 1 else step_time.flatten(1)
+            )
+            suffix, geometry_cond = SegmentTokens(embs, pad, att), self._geometry_cond(geometry, time)
+            output, _ = self._run([prefix, geometry, suffix], cond, geometry_cond, samples=samples)
             velocity = self.action_out_proj(output).view_as(noise)
         return F.mse_loss(velocity, noise - clean, reduction="none")
 
@@ -150,7 +167,7 @@ class PI05Pytorch(nn.Module):
 
         noise: (B, S, D), drawn here if None. num_steps: Euler steps, the configured number if None.
         use_cache=False recomputes every segment at every step: the slow reference that caching must equal.
-        The last three arguments are LeRobot's real-time chunking (RTC). The rest as in `forward`.
+        The last three arguments are LeRobot's real-time chunking, see real_time_chunking.py. The rest as in `forward`.
         """
         config = self.config
         if noise is None:
@@ -158,17 +175,22 @@ class PI05Pytorch(nn.Module):
         with compute_in(config.dtype, tokens.device):
             prefix, geometry = self._context(images, img_masks, tokens, masks, geom_embs, geom_pad, geom_att)
             cache = self._prefill(prefix, geometry, noise.shape[1]) if use_cache else None
-            rtc = self.rtc_processor
-            return euler_integrate(
-                lambda x_t, timestep: self._velocity(prefix, geometry, cache, x_t, timestep),
+            hard = None
+            if self.rtc_enabled and prev_chunk_left_over is not None:
+                require_delay(inference_delay)
+                if self.rtc_mode == "trained":
+                    hard = make_hard_prefix(prev_chunk_left_over, inference_delay, config.rtc_training_max_delay, noise)
+            actions: Tensor = euler_integrate(
+                lambda x_t, timestep: self._velocity(prefix, geometry, cache, x_t, timestep, hard),
                 noise,
                 num_steps or config.num_inference_steps,
-                rtc_processor=rtc,
-                rtc_enabled=rtc is not None and rtc.rtc_config.enabled,
+                rtc_processor=self.rtc_processor,
+                rtc_enabled=self.rtc_enabled and self.rtc_mode == "guided",
                 inference_delay=inference_delay,
                 prev_chunk_left_over=prev_chunk_left_over,
                 execution_horizon=execution_horizon,
             )
+            return actions if hard is None else hard.impose(actions)
 
     def denoise_step(
         self,
@@ -193,20 +215,27 @@ class PI05Pytorch(nn.Module):
         cache: SegmentKVCache | None,
         x_t: Tensor,
         timestep: Tensor,
+        hard: HardPrefix | None = None,
     ) -> Tensor:
         """Velocity of the flow, from the cache or, without one, from every segment anew.
 
-        `no_grad` although LeRobot's RTC calls this under `enable_grad`: its guidance uses no Jacobian of the network,
+        `no_grad` although LeRobot's RTC calls this under `enable_grad`: its guidance uses no gradient of the network,
         and in-place cache writes must not chain graphs.
         """
         with compute_in(self.config.dtype, x_t.device):
-            embs, pad, att, cond = self.embed_suffix(x_t, timestep)
-            given = [True, True, True] if cache is None else [False, self._geometry_follows_time, True]
-            output, _ = self._run([prefix, geometry, SegmentTokens(embs, pad, att)], cond, cache, given)
+            step_time = timestep
+            if hard is not None:
+                x_t = hard.impose(x_t)
+                step_time = timestep[:, None].masked_fill(hard.mask, 0.0)  # (B, S)
+            embs, pad, att, cond = self.embed_suffix(x_t, step_time)
+            given = [True, True, True] if cache is None else [False, self.geometry_follows_time, True]
+            geometry_cond = self._geometry_cond(geometry if given[Segment.GEOMETRY] else None, timestep)
+            output, _ = self._run([prefix, geometry, SegmentTokens(embs, pad, att)], cond, geometry_cond, cache, given)
             return self.action_out_proj(output)
 
     @property
-    def _geometry_follows_time(self) -> bool:
+    def geometry_follows_time(self) -> bool:
+        """Whether geometry is conditioned on the flow time of the denoising step, and so computed anew at every step."""
         return self.config.geometry is not None and self.config.geometry.time == "denoise"
 
     def _context(
@@ -244,16 +273,18 @@ class PI05Pytorch(nn.Module):
         )
 
     def _prefill(self, prefix: SegmentTokens, geometry: SegmentTokens | None, suffix_length: int) -> SegmentKVCache:
-        """Run prefix and (clean) geometry once and keep their keys and values."""
+        """Run prefix and (clean) geometry once, and store their keys and values."""
         lengths = [prefix.pad.shape[1], 0 if geometry is None else geometry.pad.shape[1], suffix_length]
         cache = self.paligemma_with_expert.make_cache(prefix.pad.shape[0], lengths, prefix.pad.device)
-        self._run([prefix, geometry, None], None, cache, [True, not self._geometry_follows_time, False])
+        given = [True, not self.geometry_follows_time, False]
+        self._run([prefix, geometry, None], None, self._geometry_cond(geometry, None), cache, given)
         return cache
 
     def _run(
         self,
         segments: Sequence[SegmentTokens | None],
         suffix_cond: Tensor | None,
+        geometry_cond: Tensor | None,
         cache: SegmentKVCache | None = None,
         given: Sequence[bool] = (True, True, True),
         samples: int = 1,
@@ -273,18 +304,31 @@ class PI05Pytorch(nn.Module):
             past_key_values=cache,
             inputs_embeds=[None if s is None else s.embs for s in inputs],
             use_cache=cache is not None,
-            adarms_cond=[None, self._geometry_cond(inputs[Segment.GEOMETRY], suffix_cond), suffix_cond],
+            adarms_cond=[None, geometry_cond, suffix_cond],
             outputs=(False, False, True),
         )
         return outputs[Segment.SUFFIX], cache
 
-    def _geometry_cond(self, geometry: SegmentTokens | None, suffix_cond: Tensor | None) -> Tensor | None:
-        """Geometry is a clean observation, so it is conditioned on the clean end of the flow, time 0: (1, W)."""
-        if geometry is None or self._geometry_follows_time:
-            return suffix_cond
-        return self.embed_time(torch.zeros(1, device=geometry.embs.device))
+    def _geometry_cond(self, geometry: SegmentTokens | None, time: Tensor | None) -> Tensor | None:
+        """The adaRMS condition of geometry, (1, W) at the clean end of the flow, time 0: geometry is a clean observation.
+
+        Where geometry follows the flow time (B,) it is (B, W).
+        """
+        if geometry is None:
+            return None
+        if self.geometry_follows_time:
+            return None if time is None else self.embed_time(time)
+        return self.embed_time(torch.zeros(1, device=geometry.pad.device))
 
 
 def _silence(embs: Tensor, pad: Tensor) -> Tensor:
-    """Zero padded slots: a masked key cannot act, but NaN in it would (NaN + -inf is NaN)."""
+    """Zero padded slots: a masked key has no effect, but a NaN in it would (NaN + -inf is NaN)."""
     return embs.masked_fill(~pad[..., None], 0)
+
+
+def _time_per_step(time: Tensor, steps: int, delay: Tensor) -> Tensor:
+    """Flow time (B,) or (B, K) of every action step, (B, S) or (B, K, S): 0 for the first `delay` (B,) steps of a sample."""
+    clean = torch.arange(steps, device=time.device) < delay[:, None]  # (B, S)
+    if time.ndim == 2:
+        clean = clean[:, None]
+    return time[..., None].masked_fill(clean, 0.0)

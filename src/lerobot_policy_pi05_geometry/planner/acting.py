@@ -1,92 +1,84 @@
-"""Sampling of action chunks on fake tensors: the runner and the plain path as they are, but for what needs values."""
+"""Sampling of action chunks on fake tensors: the real sampler, on a backend that tells a counter what is allocated for what."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from ..inference.runner import ChunkRunner, Context, FlowTime, Observation
+from ..inference.backend import Backend
 from ..inference.sampler import ChunkSampler
-from ..inference.side_stream import SideStream
+from ..inference.side_stream import PendingGeometry
+from ..model.config import RunnerName
+from ..model.paligemma_with_expert import PaliGemmaWithExpert
 from ..model.pi05 import PI05Pytorch
 from ..model.segment_cache import SegmentKVCache
-from ..model.segments import GeometryTokens, Segment
 from .counting import MemoryCounter
 
 Target = Literal["cuda", "cpu"]
 
 
-class CountedSide(SideStream):
-    """What measures geometry beside recorded graphs: their memory is never its own, although nothing runs in it now."""
+class CountedBackend(Backend):
+    """The choices of a target, for tensors on the CPU. The cache is counted as a cache. Nothing is recorded."""
 
-    def __init__(self, counter: MemoryCounter) -> None:
-        super().__init__(torch.device("cpu"))
+    can_record = False
+
+    def __init__(self, device: torch.device, counter: MemoryCounter, target: Target) -> None:
+        super().__init__(device)
+        self.kernels = target
         self._counter = counter
 
-    def run[T](self, work: Callable[[], T]) -> T:
-        graphs_keep = torch.empty(self._counter.spare, dtype=torch.uint8)
-        result = work()
-        del graphs_keep
-        return result
-
-
-class CountedRunner(ChunkRunner):
-    """A runner whose matrices are weights and whose cache is a cache to the counter."""
-
-    def __init__(self, network: PI05Pytorch, counter: MemoryCounter, target: Target, graphs: bool) -> None:
-        self._counter, self._target, self._graphs = counter, target, graphs
-        super().__init__(network)
-
-    def _build(self) -> None:
-        with self._counter.naming("weights"):
-            super()._build()
-        if self._graphs:
-            self._side = CountedSide(self._counter)
-
-    def refresh(self) -> None:
-        """Nothing: there are no values to compare, and no weight changes while one chunk is planned."""
-
-    def _schedule(self, segment: Segment, num_steps: int) -> list[FlowTime]:
-        """All that there will be, however few steps are run here."""
-        return super()._schedule(segment, self.config.num_inference_steps)[:num_steps]
-
-    def look(self, observation: Observation, geometry: GeometryTokens | None, room: tuple[int, int]) -> Context:
-        """Geometry that was measured before has used memory that is not the graph's: the two add up in this order, too."""
-        look = partial(super().look, observation, geometry, room)
-        return look() if geometry is None else self._side.run(look)
-
-    def _make_cache(self, batch: int, lengths: tuple[int, int, int]) -> SegmentKVCache:
-        cache = super()._make_cache(batch, lengths)
+    def new_cache(self, network: PaliGemmaWithExpert, batch: int, lengths: Sequence[int]) -> SegmentKVCache:
+        cache = super().new_cache(network, batch, lengths)
         self._counter.label([cache.keys, cache.values], "cache")
         return cache
 
-    @property
-    def kernels(self) -> str:
-        return self._target
 
-    @property
-    def _may_look(self) -> bool:
-        return False  # there are no values to look at; prompts are padded in general
+def with_memory_kept[T](counter: MemoryCounter, work: Callable[[], T]) -> T:
+    """Run work that cannot use the memory that was freed before: recorded graphs keep theirs although nothing runs in it."""
+    kept = torch.empty(counter.spare, dtype=torch.uint8)
+    result = work()
+    del kept
+    return result
 
 
 class CountedSampler(ChunkSampler):
-    """The sampler of a planned policy, which tells the counter what the cache is, whichever path computes the chunk."""
+    """The sampler of a planned policy. What the runner builds counts as weights, the cache as a cache.
+
+    target: whose kernels and graphs are assumed.
+    """
 
     def __init__(self, network: PI05Pytorch, counter: MemoryCounter, target: Target) -> None:
-        super().__init__(network)
+        super().__init__(network, partial(CountedBackend, counter=counter, target=target))
         self._counter, self._target = counter, target
 
-    def __call__(self, *observation: Any, **kwargs: Any) -> Tensor:
-        self._graphs = self._target == "cuda" and kwargs.get("runner") == "fast"
-        hook = self._network.paligemma_with_expert.register_forward_pre_hook(self._label_cache, with_kwargs=True)
-        chunk = super().__call__(*observation, **kwargs)
-        hook.remove()
-        return chunk
+    def forward(self, *observation: Any, runner: RunnerName = "fast", **kwargs: Any) -> Tensor:
+        if runner == "plain":
+            hook = self._network.paligemma_with_expert.register_forward_pre_hook(self._label_cache, with_kwargs=True)
+            actions = super().forward(*observation, runner="plain", **kwargs)
+            hook.remove()
+            return actions
+        with self._counter.naming("weights"):
+            self.prepare("eager")
+        kept: list[Tensor] = []
+        geometry = kwargs.get("geometry")
+        if geometry is not None and self._target == "cuda" and runner == "fast":
+            kwargs["geometry"] = geometry._replace(measure=partial(self._measure_beside_graphs, geometry, kept))
+        actions = super().forward(*observation, runner="eager", **kwargs)
+        kept.clear()
+        return actions
 
-    def _make_runner(self, kind: type[ChunkRunner]) -> ChunkRunner:
-        return CountedRunner(self._network, self._counter, self._target, self._graphs)
+    def _measure_beside_graphs(self, geometry: PendingGeometry, kept: list[Tensor]) -> Any:
+        """Measure geometry in memory that is not the graphs': the needs of both add up.
+
+        kept: holds the memory that was needed to measure until the chunk is done, where the graphs run later.
+        """
+        if not self._network.geometry_in_prefix:
+            return with_memory_kept(self._counter, geometry.measure)
+        tokens = geometry.measure()
+        kept.append(torch.empty(self._counter.spare, dtype=torch.uint8))
+        return tokens
 
     def _label_cache(self, _: Any, __: Any, given: Mapping[str, Any]) -> None:
         cache = given.get("past_key_values")

@@ -1,12 +1,12 @@
-"""The policy as the planner runs it: LeRobot's batches without values, so nothing looks into them."""
+"""The policy as the planner runs it: LeRobot's batches without values, so nothing may read one."""
 
 from collections.abc import Mapping, Set
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..geometry import GeometrySource
+from ..configuration_pi05_geometry import PI05GeometryConfig
+from ..geometry import GeometryEncoder, GeometrySource
 from ..geometry.da3 import Da3Encoder
 from ..geometry.source import GeometryFeatures
 from ..model.flow_matching import FlowDraw
@@ -16,7 +16,7 @@ from ..modeling_pi05_geometry import PI05GeometryPolicy
 
 
 class StoredFeatures(GeometrySource):
-    """What a feature store hands over in training: bfloat16 on the device, and float32 for the adapter."""
+    """A feature store in training: features in bfloat16 on the device, and in float32 for the adapter."""
 
     def __init__(self, cameras: tuple[str, ...], grid: int, feature_dim: int, optional: Set[str]) -> None:
         super().__init__()
@@ -31,28 +31,36 @@ class StoredFeatures(GeometrySource):
         return GeometryFeatures(features, torch.ones(shape, dtype=torch.bool))
 
 
-class PlannedPolicy(PI05GeometryPolicy):
-    """The real policy, but for what needs values: drawing noise, and checking measurements."""
+class PlannedGeometry(GeometryEncoder):
+    """Source and adapter, without the checks of measurements, which have no values here."""
 
-    def _build_source(self, dataset_meta: Any | None, encoder: Da3Encoder | None) -> GeometrySource | None:
-        if self.config.geometry_source != "features":
-            return super()._build_source(dataset_meta, encoder)
-        assert encoder is not None
-        cameras, optional = tuple(self.config.rgb_cameras()), self.config.optional_rgb_cameras()
-        return StoredFeatures(cameras, self.config.geometry_grid, encoder.variant.feature_dim, optional)
-
-    def _measure(self, batch: dict[str, Tensor]) -> GeometryTokens:
-        assert self.geometry is not None
+    def forward(self, batch: Mapping[str, Tensor]) -> GeometryTokens:
         with compute_in_float32(torch.device("cpu")):
-            tokens: GeometryTokens = self.geometry.adapter(self.geometry.source(batch, check=False))
+            tokens: GeometryTokens = self.adapter(self.source(batch, check=False))
         return tokens
 
+
+class PlannedPolicy(PI05GeometryPolicy):
+    """The real policy, but for what needs values: drawing noise, checking measurements, reading a feature store."""
+
+    def __init__(self, config: PI05GeometryConfig, encoder: Da3Encoder | None) -> None:
+        super().__init__(config, encoder=encoder)
+        if self.geometry is None:
+            return
+        source = self.geometry.source
+        if config.geometry_source == "features":
+            assert encoder is not None
+            cameras, optional = tuple(config.rgb_cameras()), config.optional_rgb_cameras()
+            source = StoredFeatures(cameras, config.geometry_grid, encoder.variant.feature_dim, optional)
+        self.geometry = PlannedGeometry(source, self.model.geometry_width)
+
     def loss(self, batch: dict[str, Tensor], whole: int) -> Tensor:
-        """What rows of a batch of `whole` samples add to its loss."""
+        """The share of these rows in the loss of a batch of `whole` samples."""
         size, steps = batch["action"].shape[:2]
         samples = () if self.config.flow_samples == 1 else (self.config.flow_samples,)
         noise = torch.zeros(size, *samples, steps, self.config.max_action_dim)
-        draw = FlowDraw(noise, torch.zeros(size, *samples), dropout=torch.zeros(size), camera=torch.zeros(size))
+        zeros = torch.zeros(size)
+        draw = FlowDraw(noise, torch.zeros(size, *samples), dropout=zeros, camera=zeros, delay=zeros.long())
         losses = self._losses(batch, draw)[..., : self.config.action_feature.shape[0]]
         valid = torch.ones(losses.shape[:2], dtype=torch.bool)
         return losses.masked_fill(~valid[..., None], 0.0).sum() / (whole * losses[0].numel())
