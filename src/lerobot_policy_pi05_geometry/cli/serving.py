@@ -24,7 +24,7 @@ def serve(
     lerobot: Annotated[
         bool, typer.Option("--lerobot", help="LeRobot's robot_client instead of openpi's clients (gRPC, loopback).")
     ] = False,
-    fps: Annotated[float, typer.Option(help="With --lerobot: the robot's control rate.")] = 30.0,
+    fps: Annotated[float | None, typer.Option(help="With --lerobot: the robot's control rate; 30 by default.")] = None,
 ) -> None:
     """Serve a checkpoint to robots on other machines: openpi's websocket protocol, or LeRobot's gRPC protocol."""
     from ..serving.extras import require_extra
@@ -33,14 +33,18 @@ def serve(
     sizes = None if batch_sizes is None else _sizes(batch_sizes)
     if lerobot:
         require_extra("serve-lerobot", "grpc")
+        if key_file is not None:
+            raise ValueError("LeRobot's robot_client can send no key, so --key-file has no use with --lerobot.")
         from ..serving.lerobot_wire.grpc_server import serve_lerobot
 
         console.print(f"Loading {checkpoint} ...")
         serve_lerobot(
-            checkpoint, device, host, 8080 if port is None else port, sizes, seed, fps,
+            checkpoint, device, host, 8080 if port is None else port, sizes, seed, 30.0 if fps is None else fps,
             lambda at: console.print(f"Serving LeRobot's robot_client at {host}:{at}", soft_wrap=True),
         )  # fmt: skip
         return
+    if fps is not None:
+        raise ValueError("--fps is for --lerobot; openpi's clients space a chunk's actions themselves.")
     from ..serving.service import serve_websocket
 
     console.print(f"Loading {checkpoint} ...")
