@@ -26,10 +26,10 @@ from lerobot_policy_pi05_geometry.checkpoint.conversion.tensor_file import Store
 WEIGHTS = "model.safetensors"
 
 
-def write_source(folder: Path) -> None:
-    """A π0.5 of the released size with random bfloat16 weights, the embedding under its tied head's name."""
+def write_source(folder: Path, paligemma: str = "gemma_2b", expert: str = "gemma_300m", pixels: int = 224) -> None:
+    """A π0.5, of the released size by default, with random bfloat16 weights, the embedding under its tied head's name."""
     with torch.device("meta"):
-        network = build_lerobot_pi05("gemma_2b", "gemma_300m", image_size=224, chunk_size=50, max_action_dim=32)
+        network = build_lerobot_pi05(paligemma, expert, image_size=pixels, chunk_size=50, max_action_dim=32)
     shapes = {name: tuple(t.shape) for name, t in network.state_dict().items() if name != EMBEDDING}
     folder.mkdir()
     block = folder / "block"
@@ -43,7 +43,9 @@ def write_source(folder: Path) -> None:
             left -= count
     write_tensors(folder / WEIGHTS, {name: StoredTensor(block, "BF16", shape, 0) for name, shape in shapes.items()})
     block.unlink()
-    (folder / "config.json").write_text(json.dumps({"action_horizon": 50}))
+    (folder / "config.json").write_text(
+        json.dumps({"action_horizon": 50, "paligemma_variant": paligemma, "action_expert_variant": expert})
+    )
 
 
 def measure(step: str, source: Path, output: Path) -> dict[str, float]:

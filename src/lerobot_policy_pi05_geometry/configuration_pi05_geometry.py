@@ -61,6 +61,7 @@ _CHOICES = {
     "geometry_positions": get_args(GeometryPositions),
     "geometry_placement": get_args(GeometryPlacement),
     "geometry_expert": get_args(GeometryExpert),
+    "geometry_tokens": ("statistics", "points"),
 }
 
 

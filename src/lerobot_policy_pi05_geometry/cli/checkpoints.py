@@ -92,6 +92,10 @@ def convert(
     geometry_grid: Annotated[int | None, typer.Option(help="Cells per side and camera.")] = None,
     geometry_frame: Annotated[str | None, typer.Option(help="Points in the robot's base frame, or camera.")] = None,
     geometry_expert: Annotated[str | None, typer.Option(help="shared, or own: a copy of the action expert.")] = None,
+    geometry_tokens: Annotated[
+        str | None,
+        typer.Option(help="Of depth: statistics of a cell's points, or points, pooled by a learned network."),
+    ] = None,
     geometry_gate_openness: Annotated[
         float | None, typer.Option(help="Of the gate at the start: 1e-7 is shut, 1 open.")
     ] = None,
@@ -130,6 +134,7 @@ def convert(
         expert=geometry_expert,
         openness=geometry_gate_openness,
         encoder=da3_encoder,
+        tokens=geometry_tokens,
     )
     run(
         source, output, geometry, features_from_data=features_from_data, chunk_size=chunk_size,

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from ..model.precision import compute_in_float32
 from ..model.segments import GeometryTokens
-from .adapter import GeometryAdapter
+from .adapter import make_adapter
 from .keys import batch_like
 from .source import GeometryFeatures, GeometrySource
 
@@ -62,7 +62,7 @@ class GeometryEncoder(nn.Module):
     def __init__(self, source: GeometrySource, width: int) -> None:
         super().__init__()
         self.source = source
-        self.adapter = GeometryAdapter(source.feature_dim, width, source.grid, len(source.cameras))
+        self.adapter = make_adapter(source, width)
         self._seen: set[str] = set()
         self._failed: set[str] = set()
         self._checked = False

@@ -17,7 +17,7 @@ from .feature_store import FeatureStoreSource
 from .feature_store.match import open_store
 from .keys import camera_of, extrinsics_key
 from .random_tokens import RandomSource
-from .rgbd import RgbdSource
+from .rgbd import RgbdSource, depth_features
 from .source import GeometrySource
 from .unknown_cameras import UnknownCameras
 
@@ -81,7 +81,10 @@ def _resolve_depth(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Re
             )
         return Resolved(RandomSource(cameras, config.geometry_grid), changes)
     if not sizes and config.geometry_pending and dataset_meta is None:
-        return Resolved(UnknownCameras(_pending(config), config.geometry_grid), changes)
+        return Resolved(
+            UnknownCameras(_pending(config), config.geometry_grid, *depth_features(config.geometry_tokens == "points")),
+            changes,
+        )
     if not sizes:
         raise ValueError(
             "geometry_source=rgbd needs depth, but the data has no observation.images.<camera>_depth and no feature that "
@@ -103,6 +106,7 @@ def _resolve_depth(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Re
         unit=config.depth_unit,
         max_depth=config.max_depth,
         depth_keys=config.depth_keys,
+        as_points=config.geometry_tokens == "points",
     )
     return Resolved(source, changes)
 

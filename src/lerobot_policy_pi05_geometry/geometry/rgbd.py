@@ -18,11 +18,13 @@ from .source import GeometryFeatures, GeometrySource
 # Wavelengths of the Fourier features of a point, in metres: from a workspace down to the width of a finger.
 WAVELENGTHS = tuple(8.0 / 2**k for k in range(8))
 FEATURE_DIM = 7 + 6 * len(WAVELENGTHS)
+SAMPLES = 4  # points per side of a cell, where features are points
 
 
 class RgbdSource(GeometrySource):
     """Per cell: mean point (3), spread (3), fraction of valid pixels (1), Fourier features of the mean (6 per wavelength).
 
+    as_points: instead, 16 points of the cell, which the adapter pools.
     calibration: per camera. sizes: (H, W) of each camera's depth. base_frame: points in the robot's base instead of
     the camera. unit, max_depth: see `depth.to_metres`. depth_keys: see `keys.find_depth_key`.
     Sources: Fourier features as in NeRF (Mildenhall et al., 2020), with wavelengths in metres.
@@ -38,10 +40,11 @@ class RgbdSource(GeometrySource):
         unit: str,
         max_depth: float,
         depth_keys: Mapping[str, str] | None = None,
+        as_points: bool = False,
     ) -> None:
         super().__init__()
         self.cameras, self.grid = cameras, grid
-        self.feature_dim = FEATURE_DIM
+        self.feature_dim, self.points = depth_features(as_points)
         self.sizes, self.base_frame, self.unit, self.max_depth = dict(sizes), base_frame, unit, max_depth
         self.depth_keys = dict(depth_keys or {})
         self.calibration = {camera: calibration[camera] for camera in cameras}
@@ -97,7 +100,7 @@ class RgbdSource(GeometrySource):
         if self.base_frame:
             points = transform(self._pose(camera, batch, depth.device, check), points)
         valid = valid & points.isfinite().all(dim=1, keepdim=True)  # with a pose of NaN no point is known
-        return cell_statistics(points, valid, self.grid)
+        return cell_points(points, valid, self.grid) if self.points else cell_statistics(points, valid, self.grid)
 
     def _pose(self, camera: str, batch: Mapping[str, Tensor], device: torch.device, check: bool) -> Tensor:
         """`base_T_camera`, (B, 4, 4) from the batch or (4, 4) from the calibration."""
@@ -119,6 +122,25 @@ class RgbdSource(GeometrySource):
             pose = calibration.extrinsics
             self._on_device[camera, device] = intrinsics, None if pose is None else torch.tensor(pose, device=device)
         return self._on_device[camera, device]
+
+
+def depth_features(as_points: bool) -> tuple[int, int]:
+    """Length of a cell's features, and how many points they are (0: statistics)."""
+    return (4 * SAMPLES**2, SAMPLES**2) if as_points else (FEATURE_DIM, 0)
+
+
+def cell_points(points: Tensor, valid: Tensor, grid: int) -> GeometryFeatures:
+    """Sample SAMPLES x SAMPLES points of each of grid x grid cells from a point map (B, 3, H, W) with validity (B, 1, H, W).
+
+    Pixels are taken at the centres of equal parts of a cell. Returns features (B, grid², 4 SAMPLES²): x, y, z and 1 for each
+    point, or four zeros where it was not measured; and validity (B, grid²), False for a cell without any.
+    """
+    side = grid * SAMPLES
+    known = torch.cat([points.masked_fill(~valid, 0.0), valid.to(points.dtype)], dim=1)  # (B, 4, H, W)
+    sampled = F.interpolate(known, size=(side, side), mode="nearest-exact")
+    cells = sampled.unflatten(3, (grid, SAMPLES)).unflatten(2, (grid, SAMPLES))  # (B, 4, g, s, g, s)
+    cells = cells.permute(0, 2, 4, 3, 5, 1).flatten(3, 4).flatten(1, 2)  # (B, G, s², 4)
+    return GeometryFeatures(cells.flatten(2), (cells[..., 3] > 0).any(dim=-1))
 
 
 def cell_statistics(points: Tensor, valid: Tensor, grid: int) -> GeometryFeatures:

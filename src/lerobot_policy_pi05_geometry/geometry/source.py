@@ -23,7 +23,8 @@ class GeometrySource(nn.Module, ABC):
 
     cameras: names of the V cameras in token order. grid: cells per side. feature_dim: C. optional: cameras that any
     observation may lack; that any other is missing is an error in training, and a failure afterwards. across_views: whether
-    features of one camera's cells depend on the other cameras.
+    features of one camera's cells depend on the other cameras. points: a cell's features are so many points, (x, y, z, 1 or 0 for
+    one that was not measured) each, in any order; 0: they are one vector.
     """
 
     cameras: tuple[str, ...]
@@ -31,6 +32,7 @@ class GeometrySource(nn.Module, ABC):
     feature_dim: int
     optional: frozenset[str] = frozenset()
     across_views: bool = False
+    points: int = 0
 
     @property
     def num_tokens(self) -> int:

@@ -16,12 +16,12 @@ logger = logging.getLogger(__name__)
 class UnknownCameras(GeometrySource):
     """Places of tokens, all of them masked: the policy acts as the π0.5 that it came from.
 
-    feature_dim: of the source that will take this one's place, by default of `RgbdSource`.
+    feature_dim, points: of the source that will take this one's place, by default of `RgbdSource`.
     """
 
-    def __init__(self, cameras: tuple[str, ...], grid: int, feature_dim: int = FEATURE_DIM) -> None:
+    def __init__(self, cameras: tuple[str, ...], grid: int, feature_dim: int = FEATURE_DIM, points: int = 0) -> None:
         super().__init__()
-        self.cameras, self.grid, self.feature_dim = cameras, grid, feature_dim
+        self.cameras, self.grid, self.feature_dim, self.points = cameras, grid, feature_dim, points
         self._said = False
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:

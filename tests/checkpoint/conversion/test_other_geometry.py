@@ -187,6 +187,16 @@ def test_another_frame_is_another_meaning(rgbd, tmp_path) -> None:
     assert config["geometry_frame"] == "camera"
 
 
+def test_points_instead_of_statistics(rgbd, tmp_path) -> None:
+    before, after, config = change(rgbd, tmp_path / "output", tokens="points")
+    pooling = {f"geometry.adapter.point_{side}.{name}" for side in ("in", "out") for name in ("weight", "bias")}
+    assert differing(before, after) == MLP | {GATE} | pooling
+    assert config["geometry_tokens"] == "points"
+    assert load_policy(tmp_path / "output").policy.geometry.source.points == 16
+    again, back, _ = change(tmp_path / "output", tmp_path / "back", grid=2)
+    assert differing(again, back) == PLACES
+
+
 def test_an_own_expert_is_added_and_left_out(rgbd, tmp_path) -> None:
     before, own, _ = change(rgbd, tmp_path / "own", expert="own")
     added = differing(before, own)

@@ -24,7 +24,8 @@ class GeometryStart:
     source: one of `SOURCES`, rgbd by default. cameras: names in token order; by default those of the source's configuration, or
     one camera whose name the training data tells. calibration: a calibration file, or None if the training data has it.
     grid, frame, expert: as in the configuration; an own expert starts as a copy of the action expert. openness: of the gate, see
-    `SHUT`. encoder: Depth Anything 3, for da3 and features: hub id, folder or safetensors file.
+    `SHUT`. encoder: Depth Anything 3, for da3 and features: hub id, folder or safetensors file. tokens: what a depth cell's token
+    is computed from, statistics or points.
     """
 
     source: str | None = None
@@ -35,6 +36,7 @@ class GeometryStart:
     expert: str | None = None
     openness: float | None = None
     encoder: str | None = None
+    tokens: str | None = None
 
     def check(self, source: str) -> None:
         """Raise ValueError for options that do not belong together. source: the geometry source that results."""
@@ -63,6 +65,7 @@ class GeometryStart:
             "geometry_grid": self.grid or 8,
             "geometry_frame": self.frame or "base",
             "geometry_expert": self.expert or "shared",
+            "geometry_tokens": self.tokens or "statistics",
             "geometry_gate_openness": SHUT if self.openness is None else self.openness,
             "geometry_positions": "parallel",
             "da3_encoder": (self.encoder or DEFAULT_ENCODER) if from_rgb else None,

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from ...configuration_pi05_geometry import DEFAULT_ENCODER, PI05GeometryConfig
-from ...geometry.adapter import GeometryAdapter
+from ...geometry.adapter import PointAdapter
 from ...geometry.da3.weights import meta_da3
 from ...geometry.resolve import camera_names
 from ...weight_files.strict_load import complain
@@ -38,7 +38,7 @@ Tensors = dict[str, StoredTensor | Tensor]
 _FROM_RGB = ("da3", "features")
 _LOG_GATE, _OPENNESS = f"{GATE}log_gate", f"{GATE}openness"
 _VIEW, _PLACES = f"{ADAPTER}view", (f"{ADAPTER}row", f"{ADAPTER}column")
-_KNOWN = {STEP, _LOG_GATE, _OPENNESS} | {ADAPTER + name for name in GeometryAdapter(1, 1, 1, 1).state_dict()}
+_KNOWN = {STEP, _LOG_GATE, _OPENNESS} | {ADAPTER + name for name in PointAdapter(4, 1, 1, 1).state_dict()}
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,7 @@ def _plan(before: PI05GeometryConfig, start: GeometryStart, features_from_data: 
     after.geometry_grid = start.grid or before.geometry_grid
     after.geometry_frame = start.frame or before.geometry_frame
     after.geometry_expert = start.expert or before.geometry_expert
+    after.geometry_tokens = start.tokens or before.geometry_tokens
     start.calibrate(after)
     if features_from_data:
         after.input_features, after.output_features, after.optional_cameras = {}, {}, {}
@@ -165,11 +166,13 @@ def _all_cameras(config: PI05GeometryConfig, source: str) -> list[str]:
     return list(whole.rgb_cameras() if source in _FROM_RGB else whole.depth_cameras())
 
 
-def _meaning(config: PI05GeometryConfig) -> tuple[str, str | None]:
+def _meaning(config: PI05GeometryConfig) -> tuple[str | None, ...]:
     """What decides what features mean, and so whether an adapter goes on reading them."""
     if config.geometry_source in _FROM_RGB:
         return "da3", config.da3_hash
-    return config.geometry_source, config.geometry_frame if config.geometry_source == "rgbd" else None
+    if config.geometry_source == "rgbd":
+        return "rgbd", config.geometry_frame, config.geometry_tokens
+    return (config.geometry_source,)
 
 
 def _value(

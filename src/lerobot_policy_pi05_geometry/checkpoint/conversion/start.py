@@ -7,7 +7,7 @@ from accelerate import init_empty_weights
 from torch import Tensor, nn
 
 from ...configuration_pi05_geometry import PI05GeometryConfig
-from ...geometry.adapter import GeometryAdapter
+from ...geometry.adapter import make_adapter
 from ...geometry.da3.weights import meta_da3
 from ...model.paligemma_with_expert import PaliGemmaWithExpert
 from ...model.segment_gate import GeometryGate
@@ -61,10 +61,9 @@ def start_values(
             name.replace(_EXPERT, OWN_EXPERT): tensor for name, tensor in stored.items() if name.startswith(_EXPERT)
         }
     if policy.geometry is not None:
-        source = policy.geometry.source
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            adapter = GeometryAdapter(source.feature_dim, policy.model.geometry_width, source.grid, len(source.cameras))
+            adapter = make_adapter(policy.geometry.source, policy.model.geometry_width)
         values |= _state(ADAPTER, adapter)
     return values
 
