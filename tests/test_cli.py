@@ -63,4 +63,4 @@ def test_conversion_and_back(tmp_path):
     assert config["geometry_cameras"] == ["front", "wrist"]
     assert (config["geometry_grid"], config["geometry_gate_openness"], config["input_features"]) == (5, 0.01, {})
     assert json.loads((back / "config.json").read_text())["type"] == "pi05"
-    assert "there already" in fail("export", str(policy), str(back))
+    assert "exists already" in fail("export", str(policy), str(back))

@@ -165,7 +165,7 @@ def test_a_missing_file_is_named(saved, tmp_path, name):
 
 def test_a_missing_folder_is_named(tmp_path):
     for folder in (tmp_path / "nowhere", "./nowhere"):
-        with pytest.raises(FileNotFoundError, match=r"Checkpoint folder .*nowhere is not there"):
+        with pytest.raises(FileNotFoundError, match=r"Checkpoint folder .*nowhere does not exist"):
             PI05GeometryPolicy.from_pretrained(folder)
 
 
@@ -205,7 +205,7 @@ def test_a_file_is_found_in_its_folder(saved):
 def test_a_file_that_may_be_missing(saved, tmp_path):
     assert find_optional_file(saved, "config.json") == saved / "config.json"
     assert find_optional_file(saved, "other.json") is None
-    with pytest.raises(FileNotFoundError, match="nowhere is not there"):
+    with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
         find_optional_file(tmp_path / "nowhere", "config.json")
 
 
@@ -228,6 +228,6 @@ def test_a_new_folder_appears_whole_or_not_at_all(tmp_path, error):
 
 
 def test_a_folder_that_is_there_is_left_alone(tmp_path):
-    with pytest.raises(FileExistsError, match=f"{tmp_path} is there already"), new_folder(tmp_path, 0):
+    with pytest.raises(FileExistsError, match=f"{tmp_path} exists already"), new_folder(tmp_path, 0):
         pass
     assert tmp_path.is_dir()

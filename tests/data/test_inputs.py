@@ -201,7 +201,7 @@ def test_the_policy_keeps_what_it_read_and_not_where_from(tmp_path):
 
 
 def test_a_file_that_is_not_there_is_an_error_and_not_the_next_choice(dataset):
-    with pytest.raises(FileNotFoundError, match=r"nowhere.json is not there"):
+    with pytest.raises(FileNotFoundError, match=r"nowhere.json does not exist"):
         resolve_calibration(make_config(calibration_path="nowhere.json"), dataset)
 
 

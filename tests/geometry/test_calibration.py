@@ -54,15 +54,15 @@ def test_whole_numbers_are_numbers(tmp_path):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nowhere.json is not there; set --policy.calibration_path"):
+    with pytest.raises(FileNotFoundError, match=r"nowhere.json does not exist; set --policy.calibration_path"):
         read_calibration_file(tmp_path / "nowhere.json")
-    with pytest.raises(FileNotFoundError, match=r"is not there"):
+    with pytest.raises(FileNotFoundError, match=r"does not exist"):
         read_calibration_file(tmp_path)  # a folder
 
 
 @pytest.mark.parametrize("content", ["", "{'frame': 'base'}", '{"frame": "base", ', b"\x89PNG\r\n\x1a\n\xff\xfe"])
 def test_what_is_no_json_is_refused(tmp_path, content):
-    assert "is no JSON" in refused(tmp_path / "c.json", content)
+    assert "is not valid JSON" in refused(tmp_path / "c.json", content)
 
 
 @pytest.mark.parametrize(
@@ -109,9 +109,13 @@ def test_missing_and_unknown_entries_of_a_camera_are_refused(tmp_path):
         ("size", None, "camera 'front'"),
         ("extrinsics", [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "4 rows of 4"),
         ("extrinsics", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]], "4 rows of 4"),
-        ("extrinsics", [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]], "no rigid transform"),
-        ("extrinsics", [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "no rigid transform"),
-        ("extrinsics", [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "no rigid transform"),
+        ("extrinsics", [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]], "must be a rigid transform"),
+        ("extrinsics", [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "must be a rigid transform"),
+        (
+            "extrinsics",
+            [[float("nan"), 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+            "must be a rigid transform",
+        ),
         ("extrinsics", 5, "camera 'front'"),
     ],
 )

@@ -108,7 +108,7 @@ def broken_poses() -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("kind", broken_poses())
 def test_what_is_no_rigid_transform_is_refused(kind):
-    with pytest.raises(ValueError, match=r"The pose are no rigid transform.*base_T_camera"):
+    with pytest.raises(ValueError, match=r"The pose must be a rigid transform.*base_T_camera"):
         check_rigid(broken_poses()[kind], "The pose")
 
 
@@ -142,5 +142,5 @@ def test_an_unusable_image_size_is_refused(size):
 
 def test_unusable_extrinsics_name_the_camera():
     pose = broken_poses()["scaled"].tolist()
-    with pytest.raises(ValueError, match=r"Extrinsics of camera 'front' are no rigid transform"):
+    with pytest.raises(ValueError, match=r"Extrinsics of camera 'front' must be a rigid transform"):
         CameraCalibration([600.0, 600.0, 320.0, 240.0], [640, 480], pose).check("front")

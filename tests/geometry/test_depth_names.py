@@ -12,8 +12,10 @@ from lerobot.datasets.factory import make_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from torch.utils.data import default_collate
+from typer.testing import CliRunner
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
+from lerobot_policy_pi05_geometry.cli import app
 from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
 from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
 from lerobot_policy_pi05_geometry.geometry.dataset_calibration import (
@@ -131,6 +133,15 @@ def test_calibration_is_kept_in_the_depth_features_info(root):
     assert info["is_depth_map"]
     assert info.pop("calibration")["frame"] == "base"
     assert meta.features == before, "nothing else changed"
+
+
+def test_a_command_stores_a_calibration_file_in_a_dataset(root, tmp_path):
+    write_calibration_file(tmp_path / "rig.json", {"front": FRONT})
+    result = CliRunner().invoke(app, ["store-calibration", str(tmp_path / "rig.json"), f"--dataset.root={root}"])
+    assert result.exit_code == 0, result.output
+    assert read_dataset_calibration(meta_of(root), {}) == {"front": FRONT}
+    with pytest.raises(FileNotFoundError, match="holds no LeRobotDataset"):
+        write_dataset_calibration(tmp_path, {"front": FRONT})
 
 
 def test_a_camera_without_depth_keeps_it_beside_its_images(tmp_path):

@@ -303,7 +303,7 @@ def test_a_pose_in_the_frame_that_is_no_rigid_transform_is_refused(kind):
     else:
         pose[1, 0, 0] = math.nan
     batch = {depth_key("front"): torch.ones(2, 1, 12, 18), extrinsics_key("front"): pose}
-    with pytest.raises(ValueError, match=r"calibration.front.extrinsics are no rigid transform"):
+    with pytest.raises(ValueError, match=r"calibration.front.extrinsics must be a rigid transform"):
         one_camera()(batch)
 
 
@@ -350,7 +350,7 @@ def test_a_pose_of_16_numbers_is_a_pose_of_4_x_4():
     for once in (poses[0], poses[0].flatten()):  # one pose for the whole batch
         same = source({depth_key("front"): depth, extrinsics_key("front"): once})
         assert torch.equal(same.features[0], expected.features[0])
-    with pytest.raises(ValueError, match=r"no rigid transform"):  # column by column
+    with pytest.raises(ValueError, match=r"must be a rigid transform"):  # column by column
         source({depth_key("front"): depth, extrinsics_key("front"): poses.mT.flatten(1)})
     for shape in ((2, 12), (2, 3, 4), (2, 7)):
         with pytest.raises(ValueError, match=r"16 numbers row by row or as 4 x 4, got shape"):

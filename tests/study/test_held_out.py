@@ -41,7 +41,7 @@ def test_errors_are_those_of_the_frames_that_are_there(root):
     chunk = 6
     deltas = {"action": [i / 20 for i in range(chunk)]}
     dataset = LeRobotDataset("local/mine", root=root, episodes=[3, 4], delta_timestamps=deltas)
-    config = SimpleNamespace(chunk_size=chunk, max_action_dim=4, device="cpu")
+    config = SimpleNamespace(chunk_size=chunk, max_action_dim=4, device="cpu", depth_keys={})
     nothing = SimpleNamespace(
         config=config, reset=lambda: None, predict_action_chunk=lambda batch, noise: torch.zeros_like(noise)
     )
@@ -65,7 +65,7 @@ def test_hidden_depth_measures_nothing_and_the_rest_stays():
         "observation.state": torch.ones(2),
     }
     for condition, front, wrist in ((ALL_CAMERAS, 1, 1), (NO_DEPTH, 0, 0), (f"{ONLY}front", 1, 0)):
-        shown = hide_depth(batch, condition)
+        shown = hide_depth(batch, condition, {})
         assert (shown[FRONT_DEPTH] == front).all(), condition
         assert (shown[WRIST_DEPTH] == wrist).all(), condition
         assert shown["observation.state"] is batch["observation.state"]

@@ -4,7 +4,7 @@
    app           the application, and options shared by several commands
    studies       demo, study                 simulation   record, train, evaluate
    checkpoints   inspect, bench, convert, export, merge
-   datasets      quantiles, precompute       planning     plan
+   datasets      quantiles, store-calibration, precompute       planning     plan
    serving       serve
 ```
 """

@@ -1,4 +1,4 @@
-"""The commands on a dataset: quantiles, precompute."""
+"""The commands on a dataset: quantiles, store-calibration, precompute."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,6 +19,20 @@ def quantiles(
     for key, shares in write_frame_quantiles(dataset_root).items():
         text = " -> ".join(" ".join(f"{share:.0%}" for share in row) for row in shares)
         console.print(f"{key}: q01 to q99 covers of min to max, per dimension: {text}")
+
+
+@app.command()
+def store_calibration(
+    calibration: Annotated[Path, typer.Argument(help="Calibration file (JSON).")],
+    dataset_root: Annotated[Path, typer.Option("--dataset.root", help="Folder of a LeRobotDataset.")],
+) -> None:
+    """Store the calibration of cameras in a dataset's meta/info.json, which LeRobot's editing tools keep."""
+    from ..geometry.calibration import read_calibration_file
+    from ..geometry.dataset_calibration import write_dataset_calibration
+
+    cameras = read_calibration_file(calibration)
+    write_dataset_calibration(dataset_root, cameras)
+    console.print(f"Stored the calibration of {', '.join(cameras)} in {dataset_root / 'meta' / 'info.json'}.")
 
 
 @app.command()

@@ -5,12 +5,17 @@
    ──────────────────────────────────► features (B, V, G, C)  ──►  tokens (B, V * G, W)
                                        validity (B, V, G)           padding mask (B, V * G)
 
-   depth         raw depth of any layout and unit -> metres and valid pixels
-   camera        calibration, point maps, rigid transforms        calibration   the JSON file
-   source        the contract                                     rgbd, random_tokens   sources
-   images        RGB of any layout -> (B, 3, H, W)                da3           a frozen encoder of RGB images, as a source
-   adapter       features -> tokens, trainable                    encoder       source + adapter, and failing cameras
-   store         a dataset's features, computed once
+   keys                 names of observations and cameras
+   depth                raw depth of any layout and unit -> metres and valid pixels
+   camera               one camera's calibration, point maps, rigid transforms
+   calibration          the calibration file               dataset_calibration   where a dataset keeps it
+   images               RGB of any layout -> (B, 3, H, W)
+   source               the interface of a source: observation -> features
+   rgbd                 depth cameras                      da3/                  a frozen encoder of RGB images
+   feature_store/       features of a dataset, computed once
+   random_tokens        a control                          unknown_cameras       a converted checkpoint before training
+   resolve              configuration + dataset -> source
+   adapter              features -> tokens, trainable      encoder               source + adapter, and cameras that fail
 ```
 
 V cameras, G = grid x grid cells per camera. A cell with no valid measurement is masked, never zero; an absent camera is

@@ -1,4 +1,4 @@
-"""The trainable bridge from geometry features to expert-width tokens."""
+"""The trainable map from geometry features to tokens of the action expert's width."""
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ _HIDDEN = 128
 class GeometryAdapter(Float32Module):
     """LayerNorm, a two-layer MLP, and learned row, column and view embeddings; stored and computed in float32.
 
-    A bf16 adapter loses its small updates. The LayerNorm is there because sources differ in scale.
+    In bfloat16 small updates would be lost. The LayerNorm makes sources of different scale alike.
     """
 
     def __init__(self, feature_dim: int, width: int, grid: int, num_views: int) -> None:
@@ -31,8 +31,8 @@ class GeometryAdapter(Float32Module):
         """Features (B, V, G, C) -> tokens (B, V * G, W) float32 and their padding mask (B, V * G) bool."""
         with compute_in_float32(geometry.features.device):
             tokens = self.embed(geometry.features.float())  # (B, V, G, W)
-            place = (self.row[:, None] + self.column[None]).flatten(0, 1)  # (G, W)
-            tokens = tokens + place + self.view[:, None]
+            position = (self.row[:, None] + self.column[None]).flatten(0, 1)  # (G, W)
+            tokens = tokens + position + self.view[:, None]
         return GeometryTokens(tokens.flatten(1, 2), geometry.valid.flatten(1, 2))
 
     def embed(self, features: Tensor) -> Tensor:

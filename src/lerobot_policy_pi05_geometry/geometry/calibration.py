@@ -22,16 +22,16 @@ _CAMERA_FIELDS = {"intrinsics", "size", "extrinsics"}
 
 
 def read_calibration_file(path: str | Path) -> dict[str, CameraCalibration]:
-    """Read and check a calibration file. Raises FileNotFoundError or ValueError with one sentence that says what is off."""
+    """Read and check a calibration file. Raises FileNotFoundError or ValueError with one sentence on what is wrong."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"Calibration file {path} is not there; set --policy.calibration_path to an existing file."
+            f"Calibration file {path} does not exist; set --policy.calibration_path to an existing file."
         )
     try:
         content = json.loads(path.read_text())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"Calibration file {path} is no JSON: {error}.") from error
+        raise ValueError(f"Calibration file {path} is not valid JSON: {error}.") from error
     return parse_calibration(content, path)
 
 

@@ -61,7 +61,7 @@ def check_rigid(pose: Tensor, what: str) -> None:
     good = pose.isfinite().all(dim=-1).all(dim=-1) & (error < RIGID_TOLERANCE) & (torch.linalg.det(rotation) > 0)
     if not good.all():
         raise ValueError(
-            f"{what} are no rigid transform (a rotation matrix with determinant 1, a translation in metres, and the "
+            f"{what} must be a rigid transform (a rotation matrix with determinant 1, a translation in metres, and the "
             f"last row 0 0 0 1): the error is {error.max().item():.3g}; give base_T_camera with OpenCV axes."
         )
 
@@ -103,4 +103,5 @@ def transform(pose: Tensor, points: Tensor) -> Tensor:
     """
     pose = pose.to(points).expand(points.shape[0], 4, 4)[..., None, None]  # (B, 4, 4, 1, 1)
     x, y, z = points[:, 0:1], points[:, 1:2], points[:, 2:3]  # (B, 1, H, W)
-    return pose[:, :3, 0] * x + pose[:, :3, 1] * y + pose[:, :3, 2] * z + pose[:, :3, 3]
+    moved = torch.addcmul(pose[:, :3, 3], pose[:, :3, 0], x)
+    return moved.addcmul_(pose[:, :3, 1], y).addcmul_(pose[:, :3, 2], z)

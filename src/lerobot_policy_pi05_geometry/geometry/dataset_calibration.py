@@ -21,7 +21,7 @@ from typing import Any
 from ..weight_files.files import write_whole
 from .calibration import BASE_FRAME, CALIBRATION_FILE, calibration_content, parse_calibration, read_calibration_file
 from .camera import CameraCalibration
-from .keys import camera_of, depth_camera_name, find_depth_keys, is_depth_key, is_depth_map
+from .keys import camera_of, depth_camera_name, depth_features, is_depth_key, is_depth_map
 
 INFO_ENTRY = "calibration"
 _INFO_FILE = Path("meta") / "info.json"
@@ -56,9 +56,12 @@ def write_dataset_calibration(
 ) -> None:
     """Store the calibration of cameras in the `info` of a dataset's features, where LeRobot's tools keep it.
 
-    depth_keys: as in `read_dataset_calibration`. Raises ValueError for a camera that the dataset does not have.
+    depth_keys: as in `read_dataset_calibration`. Raises ValueError for a camera that the
+    dataset does not have, FileNotFoundError if there is no dataset at `root`.
     """
     path = root / _INFO_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"{root} holds no LeRobotDataset (meta/info.json is missing).")
     info = json.loads(path.read_text())
     content = calibration_content(cameras)
     for camera in cameras:
@@ -87,12 +90,9 @@ def _holds_depth(key: str, feature: Mapping[str, Any], named: Mapping[str, str])
 
 def _feature_of(camera: str, features: Mapping[str, Any], depth_keys: Mapping[str, str]) -> str:
     """The feature that holds a camera's depth, or else its images."""
-    of_depth = find_depth_keys(features, depth_keys)
-    named = {key: name for name, key in of_depth.items()}
+    depth = depth_features(features, depth_keys)
     images = [key for key, feature in features.items() if feature["dtype"] in ("image", "video")]
-    depth = [key for key in images if _holds_depth(key, features[key], named)]
-    candidates = {camera_of(key): key for key in images if key not in depth}
-    candidates |= {named.get(key) or depth_camera_name(key): key for key in depth}
+    candidates = {camera_of(key): key for key in images if key not in depth.values()} | depth
     if camera not in candidates:
         known = ", ".join(sorted(candidates)) or "none"
         raise ValueError(f"The dataset has no camera '{camera}' to store a calibration of; its cameras are {known}.")

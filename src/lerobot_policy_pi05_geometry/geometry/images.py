@@ -1,4 +1,4 @@
-"""RGB images of any layout LeRobot delivers, in one form."""
+"""RGB images in the layouts that LeRobot delivers -> one layout."""
 
 import torch
 from torch import Tensor

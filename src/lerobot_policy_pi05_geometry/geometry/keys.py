@@ -91,6 +91,23 @@ def find_depth_keys(features: Mapping[str, Mapping[str, Any]], given: Mapping[st
     return found
 
 
+def depth_features(features: Mapping[str, Mapping[str, Any]], given: Mapping[str, str]) -> dict[str, str]:
+    """Camera -> key of every depth feature of a dataset. features, given: as in `find_depth_keys`."""
+    depth_keys = find_depth_keys(features, given)
+    named = {key: camera for camera, key in depth_keys.items()}
+    return {
+        named.get(key) or depth_camera_name(key): key
+        for key, feature in features.items()
+        if is_depth_key(key, depth_keys) and not _is_colour(feature)
+    }
+
+
+def _is_colour(feature: Mapping[str, Any]) -> bool:
+    """Whether a feature has three channels: a depth map that was turned into colours."""
+    shape = feature["shape"]
+    return len(shape) == 3 and 3 in (shape[0], shape[-1])
+
+
 def select_cameras[T](found: Mapping[str, T], wanted: Iterable[str] | None, what: str) -> dict[str, T]:
     """The wanted cameras in their order, or all of them sorted by name. what: what they have, for the message.
 

@@ -1,4 +1,4 @@
-"""The control that every claim about geometry needs: as many tokens, and nothing in them."""
+"""The control for experiments: as many geometry tokens, without information about the scene."""
 
 from collections.abc import Mapping
 

@@ -200,7 +200,7 @@ def check_calibration(
             known = ", ".join(sorted(calibration)) or "no camera"
             raise ValueError(
                 f"Depth camera '{camera}' has no intrinsics (the calibration has {known}); give a calibration file with "
-                "--policy.calibration_path, or put it at meta/calibration.json of the dataset."
+                "--policy.calibration_path, or store it in the dataset with pi05-geometry store-calibration."
             )
         calibration[camera].check(camera)
         posed = calibration[camera].extrinsics is not None or extrinsics_key(camera) in config.geometry_features

@@ -1,4 +1,4 @@
-"""The contract between whatever measures geometry and the network."""
+"""The interface of a geometry source: observation batch -> features per cell."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -22,9 +22,9 @@ class GeometrySource(nn.Module, ABC):
     """Turns an observation batch into per-cell features.
 
     cameras: names of the V cameras in token order. grid: cells per side. feature_dim: C. optional: cameras that any
-    observation may lack; that any other is missing is an error in training, and a failure afterwards. across_views: whether
-    features of one camera's cells depend on the other cameras. points: a cell's features are so many points, (x, y, z, 1 or 0 for
-    one that was not measured) each, in any order; 0: they are one vector.
+    observation may lack; another one that is missing is an error in training, and a failed camera at inference. across_views:
+    whether features of one camera's cells depend on the other cameras. points: number of points that a cell's features hold,
+    each as x, y, z and 1, or 0 for one that was not measured, in any order; 0: the features are one vector.
     """
 
     cameras: tuple[str, ...]
@@ -41,7 +41,7 @@ class GeometrySource(nn.Module, ABC):
 
     @abstractmethod
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
-        """Cameras for which this batch brings nothing to measure."""
+        """Cameras that have no data in this batch."""
 
     def missing_message(self, cameras: list[str]) -> str:
         """One sentence on what was expected from these cameras and what to do."""
@@ -51,6 +51,6 @@ class GeometrySource(nn.Module, ABC):
     def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
         """Features of a batch; a missing camera's cells are invalid.
 
-        batch: raw observation tensors under LeRobot's keys. check: look into the values (units, poses), which makes a
-        GPU wait; shapes and dtypes are always checked.
+        batch: raw observation tensors under LeRobot's keys. check: check values (units, poses) too, which copies to the
+        host; shapes and dtypes are always checked.
         """

@@ -1,4 +1,4 @@
-"""Cameras of geometry that no data has named yet: what a converted checkpoint has until it is trained."""
+"""The source of a converted checkpoint before training: the cameras of its geometry are not known yet."""
 
 import logging
 from collections.abc import Mapping
@@ -14,7 +14,8 @@ logger = logging.getLogger(__name__)
 
 
 class UnknownCameras(GeometrySource):
-    """Places of tokens, all of them masked: the policy acts as the π0.5 that it came from.
+    """As many tokens as the later source gives, all masked: the policy acts as the π0.5 that it was converted from.
+
 
     feature_dim, points: of the source that will take this one's place, by default of `RgbdSource`.
     """
@@ -22,7 +23,7 @@ class UnknownCameras(GeometrySource):
     def __init__(self, cameras: tuple[str, ...], grid: int, feature_dim: int = FEATURE_DIM, points: int = 0) -> None:
         super().__init__()
         self.cameras, self.grid, self.feature_dim, self.points = cameras, grid, feature_dim, points
-        self._said = False
+        self._warned = False
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
         return []
@@ -33,11 +34,11 @@ class UnknownCameras(GeometrySource):
                 "A converted checkpoint learns its geometry cameras from a dataset: build it with LeRobot's make_policy and "
                 "the dataset's metadata, as lerobot-train does."
             )
-        if not self._said:
-            self._said = True
+        if not self._warned:
+            self._warned = True
             logger.warning(
-                "No data has named this checkpoint's geometry cameras yet, so it acts without geometry, as the π0.5 it was "
-                "converted from; train it with lerobot-train --policy.path on data that has them."
+                "This checkpoint has not been trained on data with its geometry cameras yet, so it acts without geometry, as "
+                "the π0.5 that it was converted from; train it with lerobot-train --policy.path on data that has them."
             )
         like = batch_like(batch)
         shape = (like.shape[0], len(self.cameras), self.grid**2)

@@ -14,7 +14,7 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from ..checkpoint.load import LoadedPolicy
 from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..data.images import prepare_images
-from ..geometry.keys import CALIBRATION_PREFIX, DEPTH_SUFFIX, IMAGE_PREFIX, extrinsics_key
+from ..geometry.keys import CALIBRATION_PREFIX, extrinsics_key, find_depth_key, is_depth_key
 from ..inference.runner import ChunkRunner, ChunkSettings, Observation
 from ..model.segments import GeometryTokens
 
@@ -50,14 +50,14 @@ def random_observation(config: PI05GeometryConfig, task: str = "do the task") ->
         shape = (1, *feature.shape)
         if key.startswith(CALIBRATION_PREFIX):
             observation[key] = torch.eye(4)[None]
-        elif key.startswith(IMAGE_PREFIX) and key.endswith(DEPTH_SUFFIX):
+        elif is_depth_key(key, config.depth_keys) and key in config.geometry_features:
             observation[key] = torch.full(shape, 1000.0 if config.depth_unit == "mm" else 1.0)
         elif feature.type is FeatureType.VISUAL:
             observation[key] = torch.rand(shape, generator=random)
         elif key == OBS_STATE:
             observation[key] = torch.zeros(shape)
     for camera, calibration in config.calibration.items():
-        if calibration.extrinsics is None and f"{IMAGE_PREFIX}{camera}{DEPTH_SUFFIX}" in observation:
+        if calibration.extrinsics is None and find_depth_key(camera, observation, config.depth_keys) is not None:
             observation.setdefault(extrinsics_key(camera), torch.eye(4)[None])
     return observation
 

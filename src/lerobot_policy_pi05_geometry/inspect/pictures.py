@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from ..geometry.depth import to_metres
-from ..geometry.keys import depth_key
+from ..geometry.keys import find_depth_key
 from ..modeling_pi05_geometry import PI05GeometryPolicy
 from .attention import attention_layout, suffix_attention
 
@@ -62,8 +62,9 @@ def depth_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Fig
         rgb = _rgb(batch, camera)
         size = policy.config.depth_cameras()[camera]
         shown = np.full(size, np.nan)
-        if depth_key(camera) in batch:
-            raw = batch[depth_key(camera)][:1].cpu()
+        key = find_depth_key(camera, batch, policy.config.depth_keys)
+        if key is not None:
+            raw = batch[key][:1].cpu()
             depth, valid = to_metres(raw, camera, policy.config.depth_unit, size, policy.config.max_depth)
             shown[:] = np.where(valid[0, 0].numpy(), depth[0, 0].numpy(), np.nan)
         if rgb is not None:

@@ -2,7 +2,7 @@
 
 ```
    frames    the RGB frames of a LeRobotDataset, batch by batch, in order
-   run       the store's files, one after the other; interrupted and started again, it goes on where it stopped
+   run       the store's files, one after the other; interrupted and started again, it continues where it stopped
 ```
 """
 

@@ -6,9 +6,9 @@ from ..configuration_pi05_geometry import PI05GeometryConfig
 
 
 def refuse_augmentation(training: TrainPipelineConfig) -> None:
-    """Raise ValueError for training that changes images of which it has the features already.
+    """Raise ValueError for training that augments images whose features were computed in advance.
 
-    Only commands that see LeRobot's whole configuration can ask; the policy cannot.
+    Only commands that see LeRobot's whole configuration can check this; the policy cannot.
     """
     policy = training.policy
     if (
@@ -17,6 +17,6 @@ def refuse_augmentation(training: TrainPipelineConfig) -> None:
         and training.dataset.image_transforms.enable
     ):
         raise ValueError(
-            "geometry_source=features holds features of the images as they are, so they cannot be augmented: set "
+            "geometry_source=features holds features of the unchanged images, so they cannot be augmented: set "
             "--dataset.image_transforms.enable=false, or train with --policy.geometry_source=da3."
         )

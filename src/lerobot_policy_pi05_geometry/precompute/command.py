@@ -1,4 +1,4 @@
-"""What the command does around the work: which device and share, what it says, and the bar."""
+"""The command around the computation: device, share of this process, messages, progress bar."""
 
 import os
 import time
@@ -27,7 +27,7 @@ def run_precompute(
     check: bool,
     bars: Progress,
 ) -> None:
-    """Carry out this process's share of a store, under torchrun or by itself. The parameters are the command's options."""
+    """Compute this process's share of a store, under torchrun or alone. The parameters are the command's options."""
     if root is not None and not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{root} holds no LeRobotDataset (meta/info.json is missing).")
     rank, world_size = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
@@ -39,7 +39,7 @@ def run_precompute(
     _compute(work, batch_size, _device(device), rank, world_size, bars)
     if work.missing():
         bars.console.print(
-            "This process's files are done; the store is finished when the other processes' are "
+            "This process's files are done; the store is finished when those of the other processes are "
             f"({len(work.missing())} of {work.manifest.shards} files are missing)."
         )
         return
@@ -84,7 +84,7 @@ def _compute(
 
 
 def _device(name: str | None) -> torch.device:
-    """The device of this process; with several GPUs, each rank on a machine has its own."""
+    """The device of this process; with several GPUs, each rank of a machine uses its own."""
     if name is None:
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda":

@@ -1,4 +1,4 @@
-"""The RGB frames of a LeRobotDataset, batch by batch, in order: the images that training sees, without the rest of a sample."""
+"""The RGB frames of a LeRobotDataset, batch by batch, in order, without the rest of a sample."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,13 +10,13 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import decode_video_frames
 from torch import Tensor
 
-_TOLERANCE = 1e-4  # seconds between a frame's time and the video's, as LeRobot has it
+_TOLERANCE = 1e-4  # seconds between a frame's time and the video's, LeRobot's default
 
 
 class Frames:
     """Images of some keys of a dataset, by dataset index.
 
-    An episode's frames of one video are decoded in one go, which is several times faster than one by one.
+    Frames of one episode and video are decoded together, which is several times faster than one by one.
     """
 
     def __init__(self, dataset: LeRobotDataset, keys: Sequence[str]) -> None:
@@ -56,7 +56,7 @@ class Frames:
         return torch.cat(parts)
 
     def read_ahead(self, batches: Iterable[range]) -> Iterator[tuple[range, dict[str, Tensor]]]:
-        """Every batch with its images, the next one being read while the caller works on this one."""
+        """Every batch with its images. The next batch is read while the caller processes this one."""
         with ThreadPoolExecutor(max_workers=1) as pool:
             pending = None
             for batch in batches:

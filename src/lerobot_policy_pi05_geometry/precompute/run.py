@@ -26,7 +26,7 @@ from ..geometry.feature_store.reader import missing_shards
 from ..geometry.feature_store.shards import lock_beside, writing
 from .frames import Frames
 
-SHARD_FRAMES = 512  # 100 MB for one camera of DA3-BASE at 8 x 8: small enough to share out, few enough to list
+SHARD_FRAMES = 512  # 100 MB for one camera of DA3-BASE at 8 x 8: small enough to divide among processes, and few files
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Precompute:
     folder: Path
 
     def missing(self, rank: int = 0, world_size: int = 1) -> list[int]:
-        """Files that are not finished, of those that this rank takes."""
+        """Files of this rank that are not finished."""
         return [shard for shard in missing_shards(self.folder, self.manifest) if shard % world_size == rank]
 
     def run(
@@ -50,8 +50,8 @@ class Precompute:
         world_size: int = 1,
         on_progress: Callable[[int, bool], None] = lambda frames, found: None,
     ) -> None:
-        """Compute this rank's share. on_progress: called with a number of frames more that are done, and whether they were
-        found in an unfinished file.
+        """Compute this rank's share. on_progress: called with a number of frames that are done in addition, and whether
+        they were found in an unfinished file.
 
         Batches begin at multiples of `batch_size` within a file, wherever this was interrupted: the files are then the same
         to the byte. Raises OSError when the disk is full; what is computed is kept.
@@ -87,7 +87,7 @@ def prepare(
     output: Path | None = None,
     shard_frames: int = SHARD_FRAMES,
 ) -> Precompute:
-    """Find the encoder and the cameras, as a policy of these settings would, and the store that belongs to them.
+    """Find the encoder and the cameras, as a policy with these settings does, and the store for them.
 
     output: folder for stores; None: the dataset's own. Writes nothing.
     Raises FileNotFoundError or ValueError, with one sentence, for what is not found or does not fit.

@@ -18,11 +18,11 @@ import torch
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch.utils.data import default_collate
 
 from ..checkpoint.load import LoadedPolicy, load_policy
-from ..geometry.keys import DEPTH_SUFFIX, depth_key
+from ..geometry.keys import DEPTH_SUFFIX, depth_features, find_depth_key, is_depth_key
 from .arms import find_arm
 from .runs import ReportProgress, Run, option_list, versions
 from .training import train_with
@@ -191,24 +191,22 @@ def held_out_runs(
 
 def view_conditions(root: Path, repo_id: str) -> list[str]:
     """Conditions for an arm with depth: all depth cameras, each one alone, and none."""
-    prefix = f"{OBS_IMAGES}."
-    keys = LeRobotDatasetMetadata(repo_id, root=root).features
-    cameras = sorted(
-        key.removeprefix(prefix).removesuffix(DEPTH_SUFFIX)
-        for key in keys
-        if key.startswith(prefix) and key.endswith(DEPTH_SUFFIX)
-    )
+    cameras = sorted(depth_features(LeRobotDatasetMetadata(repo_id, root=root).features, {}))
     single = [f"{ONLY}{camera}" for camera in cameras] if len(cameras) > 1 else []
     return [ALL_CAMERAS, *single, NO_DEPTH] if cameras else [ALL_CAMERAS]
 
 
-def hide_depth(batch: dict[str, Any], condition: str) -> dict[str, Any]:
-    """The batch with the depth of all cameras but the condition's set to zero (no measurement)."""
+def hide_depth(batch: dict[str, Any], condition: str, depth_keys: Mapping[str, str]) -> dict[str, Any]:
+    """The batch with the depth of all cameras but the condition's set to zero (no measurement).
+
+    depth_keys: of the policy's configuration.
+    """
     if condition == ALL_CAMERAS:
         return batch
-    kept = depth_key(condition.removeprefix(ONLY)) if condition.startswith(ONLY) else None
+    only = condition.startswith(ONLY)
+    kept = find_depth_key(condition.removeprefix(ONLY), batch, depth_keys) if only else None
     return {
-        key: torch.zeros_like(value) if key.endswith(DEPTH_SUFFIX) and key != kept else value
+        key: torch.zeros_like(value) if is_depth_key(key, depth_keys) and key != kept else value
         for key, value in batch.items()
     }
 
@@ -238,7 +236,8 @@ def action_errors(
         noise = torch.randn(shape, generator=torch.Generator().manual_seed(_NOISE_SEED + int(episode)))
         policy.reset()
         chunk = policy.predict_action_chunk(
-            loaded.preprocess(hide_depth(observation, condition)), noise=noise.to(policy.config.device)
+            loaded.preprocess(hide_depth(observation, condition, policy.config.depth_keys)),
+            noise=noise.to(policy.config.device),
         )
         predicted = torch.stack([loaded.postprocess(step) for step in chunk.unbind(1)], dim=1)  # (N, S, D)
         error = (predicted.cpu() - actions).abs().masked_fill(is_pad[..., None], float("nan"))

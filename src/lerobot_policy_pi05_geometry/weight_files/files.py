@@ -25,23 +25,23 @@ def find_file(model_id: str | Path, name: str, **hub: Any) -> Path:
             )
         return folder / name
     if folder.is_absolute() or str(model_id).startswith((".", "~")) or str(model_id).count("/") != 1:
-        raise FileNotFoundError(f"Checkpoint folder {model_id} is not there.")
+        raise FileNotFoundError(f"Checkpoint folder {model_id} does not exist.")
     try:
         return Path(hf_hub_download(repo_id=str(model_id), filename=name, **hub))
     except LocalEntryNotFoundError as error:
         raise FileNotFoundError(
-            f"Checkpoint {model_id} is no folder here, and the hub cannot be reached for its {name}, which is not cached."
+            f"Checkpoint {model_id} is no local folder, and the hub cannot be reached for its {name}, which is not cached."
         ) from error
     except EntryNotFoundError as error:
         raise FileNotFoundError(f"Checkpoint {model_id} on the hub has no {name}.") from error
     except RepositoryNotFoundError as error:
         raise FileNotFoundError(
-            f"There is no {model_id} on the hub, or your token does not open it; check the name, or log in with `hf auth login`."
+            f"There is no {model_id} on the hub, or your token has no access; check the name, or log in with `hf auth login`."
         ) from error
 
 
 def find_optional_file(model_id: str | Path, name: str, **hub: Any) -> Path | None:
-    """A file of a checkpoint that it may lack. Raises FileNotFoundError if the hub cannot be asked."""
+    """A file that a checkpoint may lack; None if it does. Raises FileNotFoundError if the hub cannot be reached."""
     try:
         return find_file(model_id, name, **hub)
     except FileNotFoundError as error:
@@ -53,12 +53,12 @@ def find_optional_file(model_id: str | Path, name: str, **hub: Any) -> Path | No
 
 @contextmanager
 def new_folder(output: Path, size: int) -> Iterator[Path]:
-    """A folder beside `output` that takes its place when the block ends, and is removed if it fails.
+    """A folder beside `output` that is renamed to it when the block ends, and removed if the block fails.
 
-    size: bytes that will be written. Raises FileExistsError if `output` is there, OSError if the disk is too full.
+    size: bytes that will be written. Raises FileExistsError if `output` exists, OSError if the disk has too little space.
     """
     if output.exists():
-        raise FileExistsError(f"{output} is there already; name a folder that is not.")
+        raise FileExistsError(f"{output} exists already; name a folder that does not.")
     parent = output.absolute().parent
     missing = [folder for folder in (parent, *parent.parents) if not folder.exists()]
     parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +68,7 @@ def new_folder(output: Path, size: int) -> Iterator[Path]:
         if free < size:
             raise OSError(f"{output} needs {size / 1e9:.1f} GB, but its disk has {free / 1e9:.1f} GB left.")
         yield partial
-        partial.chmod(0o755)  # mkdtemp's folder is its owner's alone
+        partial.chmod(0o755)  # mkdtemp makes it accessible to its owner only
         partial.rename(output)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -104,6 +104,6 @@ def require_policy_type(model_id: str | Path, expected: str, **hub: Any) -> None
             else "choose another checkpoint"
         )
         raise ValueError(
-            f"{model_id} is a checkpoint of type '{found}', not '{expected}': its weights and processors are laid out "
-            f"differently, so it cannot be loaded as it is; {convert}."
+            f"{model_id} is a checkpoint of type '{found}', not '{expected}': its weights and processors have another "
+            f"layout, so it cannot be loaded unchanged; {convert}."
         )

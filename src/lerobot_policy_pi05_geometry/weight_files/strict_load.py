@@ -1,4 +1,4 @@
-"""Strict loading: a safetensors file fills a module whole or not at all, and the error says what is wrong with it."""
+"""Strict loading: a safetensors file fills a module completely, or is refused with the reason."""
 
 from pathlib import Path
 
@@ -12,9 +12,9 @@ _NAMED = 5  # how many tensors an error names
 def load_strictly(module: nn.Module, path: str | Path, prefix: str = "", others: tuple[str, ...] = ()) -> None:
     """Fill `module` from a safetensors file, tensor by tensor, cast to the dtype each parameter is stored in.
 
-    Everything is checked before anything is written. Parameters on the meta device become real ones, so no second copy
-    of the model is ever held. prefix: what the module's names stand behind in the file. others: how the names of tensors
-    begin that the file may hold beside them, and that are left out.
+    Everything is checked before anything is written. Parameters on the meta device become real ones, so memory
+    never holds a second copy of the model. prefix: of the module's names in the file. others: prefixes of tensors that the file
+    may hold in addition; they are skipped.
 
     Raises ValueError for a file that is truncated, or tensors that are missing, unknown, or of a wrong shape or dtype.
     """
@@ -34,14 +34,14 @@ def load_strictly(module: nn.Module, path: str | Path, prefix: str = "", others:
                     wrong.append(f"{name} (dtype {dtype}, expected {target.dtype})")
             complain(path, "has wrong", wrong)
             for name, target in expected.items():
-                # A clone, not the memory-mapped file, which could be overwritten beneath a running policy.
+                # A clone, not the memory map: the file could be overwritten while the policy runs.
                 _assign(module, name.removeprefix(prefix), file.get_tensor(name).to(target.dtype).clone())
     except SafetensorError as error:
         raise ValueError(f"{path} is truncated or no safetensors file ({error}); copy or download it again.") from error
 
 
 def complain(path: str | Path, what: str, names: list[str], left: str = "nothing was loaded") -> None:
-    """Raise ValueError if there are `names`, tensors of a file that `what` is wrong with; `left` says what it led to."""
+    """Raise ValueError if there are `names`: tensors of a file with the fault `what`. left: the consequence."""
     if names:
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
         raise ValueError(f"Checkpoint {path} {what} tensors: {', '.join(names[:_NAMED])}{more}; {left}.")

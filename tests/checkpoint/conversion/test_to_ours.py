@@ -331,7 +331,7 @@ def test_what_is_there_is_not_overwritten(lerobot_source, tmp_path):
     output = tmp_path / "output"
     for make in (lambda: output.mkdir(), lambda: (output.rmdir(), output.write_text("mine"))):
         make()
-        with pytest.raises(FileExistsError, match=f"{output} is there already"):
+        with pytest.raises(FileExistsError, match=f"{output} exists already"):
             convert(lerobot_source, output)
     assert output.read_text() == "mine"
     assert folder_contents(tmp_path) == {"output"}

@@ -122,7 +122,9 @@ def test_an_encoder_that_moved_is_named_anew(encoder, tmp_path):
     policy = make_da3(own)
     policy.save_pretrained(tmp_path / "checkpoint")
     shutil.rmtree(own)
-    with pytest.raises(FileNotFoundError, match=rf"encoder is not found: .*{own} is not there; .*--policy.da3_encoder"):
+    with pytest.raises(
+        FileNotFoundError, match=rf"encoder is not found: .*{own} does not exist; .*--policy.da3_encoder"
+    ):
         PI05GeometryPolicy.from_pretrained(tmp_path / "checkpoint")
     config = PreTrainedConfig.from_pretrained(tmp_path / "checkpoint", cli_overrides=[f"--da3_encoder={encoder}"])
     loaded = PI05GeometryPolicy.from_pretrained(tmp_path / "checkpoint", config=config)

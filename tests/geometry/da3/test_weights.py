@@ -83,7 +83,7 @@ def test_a_truncated_file_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("encoder", "said"),
     [
-        ("nowhere/to/be/found", "folder nowhere/to/be/found is not there"),
+        ("nowhere/to/be/found", "folder nowhere/to/be/found does not exist"),
         (
             "depth-anything/NO-SUCH-MODEL",
             "depth-anything/NO-SUCH-MODEL is no folder here, and the hub cannot be reached",

@@ -8,7 +8,7 @@
    source        Da3Source: an observation's cameras -> cells
 ```
 
-Names, shapes and constants are facts of the released weights and of the package `depth-anything-3` 0.1.1 (Apache-2.0), with
+Names, shapes and constants are those of the released weights and of the package `depth-anything-3` 0.1.1 (Apache-2.0), with
 which tests/geometry/da3/test_upstream.py compares.
 """
 

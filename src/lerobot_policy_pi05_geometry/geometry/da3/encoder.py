@@ -1,4 +1,4 @@
-"""The backbone, frozen: raw images in, features out, and nothing about it ever changes."""
+"""The frozen backbone: raw images in, features out."""
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -13,7 +13,7 @@ DEVIATION = (0.229, 0.224, 0.225)
 
 
 class Da3Encoder(nn.Module):
-    """Always in evaluation mode, without gradients, computing in `dtype` whatever autocast its caller has on.
+    """Always in evaluation mode, without gradients, computing in `dtype` whatever autocast is on in its caller.
 
     content_hash: SHA-256 of the backbone's released tensors, None for weights that come from no file.
     """
@@ -42,10 +42,10 @@ class Da3Encoder(nn.Module):
 
 
 def store_products_in(backbone: Da3Backbone, dtype: torch.dtype) -> None:
-    """Keep the weights of matrix products in the dtype they are used in; norms, scales and embeddings stay float32.
+    """Store the weights of matrix products in the dtype they are used in; norms, scales and embeddings stay float32.
 
-    The result is autocast's own, bit for bit, without casting every weight anew at every call: autocast remembers casts
-    of trainable weights only. It also halves the memory.
+    The result is that of autocast, bit for bit. Autocast caches casts of trainable weights only, so it would cast frozen
+    ones at every call. It also halves the memory.
     """
     for module in backbone.modules():
         if isinstance(module, nn.Linear | nn.Conv2d):

@@ -11,7 +11,7 @@ from ..source import GeometryFeatures, GeometrySource
 from .encoder import Da3Encoder, resize
 from .variants import PATCH
 
-_SMALLEST = 196  # pixels: below this, patches are few
+_SMALLEST = 196  # pixels; a smaller image has too few patches
 
 
 def default_image_size(grid: int) -> int:
@@ -21,7 +21,7 @@ def default_image_size(grid: int) -> int:
 
 
 class Da3Source(GeometrySource):
-    """Features of a frozen any-view encoder; cameras are resized to a square and see each other.
+    """Features of a frozen any-view encoder; cameras are resized to a square and attend to each other.
 
     keys: camera name -> key of its images, in token order; the first camera that is present is the reference view.
     image_size: pixels per side, a multiple of 14 * grid. optional: cameras that observations may lack.
@@ -47,7 +47,7 @@ class Da3Source(GeometrySource):
                 f"da3_image_size must be a multiple of {PATCH * grid} pixels, so that a grid of {grid} holds whole patches of "
                 f"{PATCH}, got {self.image_size}."
             )
-        # In a tuple, so that the policy does not own it: no checkpoint, optimiser, train() or DDP ever meets its weights.
+        # In a tuple, so that it is no submodule: checkpoint, optimiser, train() and DDP do not see its weights.
         self._frozen = (encoder,)
 
     @property
@@ -65,7 +65,7 @@ class Da3Source(GeometrySource):
         )
 
     def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
-        """See `GeometrySource.forward`. Values of images are not looked into, so nothing makes a GPU wait."""
+        """See `GeometrySource.forward`. Values of images are not checked, so nothing is copied to the host."""
         present = [i for i, camera in enumerate(self.cameras) if self.keys[camera] in batch]
         like = batch_like(batch)
         shape = (like.shape[0], len(self.cameras), self.grid**2)
@@ -73,7 +73,7 @@ class Da3Source(GeometrySource):
         valid = torch.zeros(shape, dtype=torch.bool, device=like.device)
         if present:
             images = torch.stack([self._image(self.cameras[i], batch) for i in present], dim=1)
-            if self.encoder.mean.device != images.device:  # it is nobody's submodule, so it follows the images
+            if self.encoder.mean.device != images.device:  # it is no submodule, so `policy.to` does not move it
                 self.encoder.to(images.device)
             pooled = pool(self.encoder(images), self.grid)
             for view, i in enumerate(present):

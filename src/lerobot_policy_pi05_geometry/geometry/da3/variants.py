@@ -1,4 +1,4 @@
-"""The sizes in which Depth Anything 3 is released, their licences, and how a file tells which one it holds."""
+"""The sizes in which Depth Anything 3 is released, their licences, and which of them a file holds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class Da3Variant:
 VARIANTS = {
     variant.name: variant
     for variant in (
-        Da3Variant("tiny", 32, 6, 2, (3, 5), 2),  # ours, for tests; nothing is released in this size
+        Da3Variant("tiny", 32, 6, 2, (3, 5), 2),  # for tests; not a released size
         Da3Variant("small", 384, 12, 6, (5, 7, 9, 11), 4),
         Da3Variant("base", 768, 12, 12, (5, 7, 9, 11), 4),
         Da3Variant("large", 1024, 24, 16, (11, 15, 19, 23), 8, non_commercial=True),
@@ -53,12 +53,12 @@ VARIANTS = {
 def variant_of(shapes: Mapping[str, tuple[int, ...]], origin: str) -> Da3Variant:
     """Which variant a file holds, from its tensors' names and shapes. origin: the file, for the message.
 
-    Whether everything else fits is for strict loading to say. Raises ValueError for a file of another kind.
+    Strict loading checks everything else. Raises ValueError for a file of another kind.
     """
     if any(name.startswith(_NESTED_PREFIX) for name in shapes):
         raise ValueError(
-            f"{origin} is a nested Depth Anything 3 (CC BY-NC 4.0), which is not supported: its metric half serves depth "
-            "alone; use its any-view half, depth-anything/DA3-GIANT, or the default depth-anything/DA3-BASE."
+            f"{origin} is a nested Depth Anything 3 (CC BY-NC 4.0), which is not supported: its metric half only gives "
+            "depth; use its any-view half, depth-anything/DA3-GIANT, or the default depth-anything/DA3-BASE."
         )
     width = shapes.get(f"{BACKBONE_PREFIX}cls_token", (0,))[-1]
     any_view = f"{BACKBONE_PREFIX}camera_token" in shapes

@@ -47,7 +47,7 @@ def _identify(config: "PI05GeometryConfig") -> tuple[Path, Da3Encoder]:
     """File and architecture of the configuration's encoder, with parameters on the meta device."""
     name = config.da3_encoder
     if name is None:
-        raise ValueError("This policy names no Depth Anything 3 encoder; say which by --policy.da3_encoder.")
+        raise ValueError("This policy names no Depth Anything 3 encoder; give one by --policy.da3_encoder.")
     path = find_encoder(name)
     variant = read_variant(path)
     _warn_of_licence(name, variant)
@@ -101,7 +101,7 @@ def find_encoder(encoder: str) -> Path:
 
 
 def _warn_of_licence(encoder: str, variant: Da3Variant) -> None:
-    """Say once per encoder that its weights are not for commercial use."""
+    """Log once per encoder that its weights are not for commercial use."""
     if variant.non_commercial and encoder not in _warned:
         _warned.add(encoder)
         logger.warning(

@@ -1,6 +1,6 @@
-"""The files of features: written so that an interruption loses nothing, and checked frame by frame when read.
+"""The files of features: an interruption loses no finished frame, and every frame is checked when it is read.
 
-shard-00000.partial   grows by whole batches; what of it is good is told by the checksums in it
+shard-00000.partial   grows by whole batches; its checksums say how many frames are good
 shard-00000.sha256    of the finished file, as `sha256sum -c` reads it; written before the file gets its name
 shard-00000.bin       finished, never written again
 """
@@ -25,7 +25,7 @@ _CRC_ELEMENTS = 2  # a CRC-32 is as long as two bfloat16 numbers
 def checksum(features: Tensor, key: str, index: int) -> int:
     """CRC-32 of a frame's features (contiguous bfloat16), of the store's key and of the frame's index.
 
-    With key and index in it, a file of another store, or under another number, does not pass for this one.
+    Key and index are included, so that a file of another store, or under another number, is detected.
     """
     return zlib.crc32(features.flatten().view(torch.uint8).numpy(), zlib.crc32(f"{key} {index}".encode()))
 
@@ -45,7 +45,7 @@ def records(features: Tensor, key: str, first: int) -> bytes:
 def map_records(path: Path, manifest: Manifest, frames: int) -> Tensor:
     """The first `frames` records of a file as a memory map: (frames, V * G * C + 2) bfloat16, not to be written to.
 
-    The file is closed again at once, so that thousands of shards do not run into the limit of open files.
+    The file is closed at once: thousands of open shards would exceed the limit of open files.
     """
     size = frames * manifest.record_bytes // 2
     return torch.from_file(str(path), shared=False, size=size, dtype=torch.bfloat16).view(frames, -1)
@@ -58,7 +58,7 @@ def is_good(record: Tensor, key: str, index: int) -> bool:
 
 
 class ShardWriter:
-    """Appends batches to one shard. Made by `writing`, which sees to it that nobody else does."""
+    """Appends batches to one shard. Made by `writing`, which allows one writer at a time."""
 
     def __init__(self, folder: Path, manifest: Manifest, shard: int, batch: int) -> None:
         self._manifest, self._frames, self._batch = manifest, manifest.frames_of(shard), batch
@@ -66,12 +66,12 @@ class ShardWriter:
         self._partial = self._path.with_suffix(".partial")
         self.done = self._good_frames()
         if self.done < len(self._frames):
-            self.done -= self.done % batch  # a batch that was cut short is computed again as a whole
+            self.done -= self.done % batch  # a batch that is incomplete is computed again
         with self._partial.open("ab") as file:
             file.truncate(self.done * manifest.record_bytes)
 
     def _good_frames(self) -> int:
-        """How many frames from the start are whole and right."""
+        """How many frames from the start are complete and correct."""
         if not self._partial.exists():
             return 0
         whole = min(self._partial.stat().st_size // self._manifest.record_bytes, len(self._frames))
@@ -83,7 +83,7 @@ class ShardWriter:
         return whole
 
     def batches(self) -> list[range]:
-        """Dataset indices of the batches that are left; they are the same wherever this was interrupted."""
+        """Dataset indices of the batches that remain; an interruption does not change them."""
         starts = range(self._frames.start + self.done, self._frames.stop, self._batch)
         return [range(start, min(start + self._batch, self._frames.stop)) for start in starts]
 
@@ -94,7 +94,7 @@ class ShardWriter:
         self.done += len(features)
 
     def finish(self) -> None:
-        """Give the complete file its name."""
+        """Give the complete file its final name."""
         with self._partial.open("rb+") as file:
             os.fsync(file.fileno())
             digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -104,7 +104,7 @@ class ShardWriter:
 
 @contextmanager
 def writing(folder: Path, manifest: Manifest, shard: int, batch: int) -> Iterator[ShardWriter | None]:
-    """A writer that goes on where the last one stopped; None if the shard is finished, or another process writes it."""
+    """A writer that continues where the last one stopped; None if the shard is finished, or another process writes it."""
     lock = lock_beside(folder, f"shard-{shard:05d}")
     try:
         with lock.acquire(timeout=0):
@@ -115,7 +115,7 @@ def writing(folder: Path, manifest: Manifest, shard: int, batch: int) -> Iterato
 
 
 def lock_beside(folder: Path, name: str) -> FileLock:
-    """A lock that ends with its process. It lies outside of the store, which holds nothing but results."""
+    """A lock that ends with its process. Its file is outside of the store, which holds results only."""
     locks = folder.parent / ".locks"
     locks.mkdir(parents=True, exist_ok=True)
     return FileLock(locks / f"{folder.name}-{name}.lock")

@@ -1,4 +1,4 @@
-"""The store as a geometry source: training reads it, everything that is no frame of the dataset is looked at live."""
+"""The store as a geometry source. Frames of the dataset are read; other observations go through the encoder."""
 
 from collections.abc import Callable, Mapping, Set
 
@@ -12,7 +12,7 @@ _INDEX = "index"  # LeRobot's name for a frame's place in the dataset
 
 
 class FeatureStoreSource(GeometrySource):
-    """Features of a dataset's frames by their `index`. They are what `live` would measure, rounded to bfloat16.
+    """Features of a dataset's frames by their `index`. They are what `live` would compute, rounded to bfloat16.
 
     live: makes the source that the store was computed with; called when, outside of training, an observation has no index
     (an environment that lerobot-train evaluates in). optional: cameras that observations may lack.
@@ -41,7 +41,7 @@ class FeatureStoreSource(GeometrySource):
             return self._find_live()(batch, check)
         if _INDEX not in batch:
             raise ValueError(
-                "A training batch has no 'index', by which the feature store knows its frames; train on a LeRobotDataset, or "
+                "A training batch has no 'index', by which the feature store finds its frames; train on a LeRobotDataset, or "
                 "with --policy.geometry_source=da3."
             )
         index = batch[_INDEX]
@@ -54,5 +54,5 @@ class FeatureStoreSource(GeometrySource):
 
     def _find_live(self) -> GeometrySource:
         if not self._live:
-            self._live = (self._make_live(),)  # in a tuple: nobody's submodule
+            self._live = (self._make_live(),)  # in a tuple, so that it is no submodule
         return self._live[0]
