@@ -86,7 +86,7 @@ def test_a_truncated_file_is_refused(tmp_path):
         ("nowhere/to/be/found", "folder nowhere/to/be/found does not exist"),
         (
             "depth-anything/NO-SUCH-MODEL",
-            "depth-anything/NO-SUCH-MODEL is no folder here, and the hub cannot be reached",
+            "depth-anything/NO-SUCH-MODEL is no local folder, and the hub cannot be reached",
         ),
     ],
 )
