@@ -170,6 +170,16 @@ def test_rows_of_leaves_alone_what_belongs_to_the_whole_batch():
     assert torch.equal(rows["action"], batch["action"][1:3])
 
 
+@pytest.mark.parametrize("size", [3, 4, 16])
+def test_poses_of_samples_are_cut_and_those_of_the_whole_batch_are_not(size):
+    """As 4 x 4 or as 16 numbers, also where a batch is as long as a pose."""
+    poses = torch.arange(size * 16.0).view(size, 4, 4)
+    for per_sample in (poses, poses.flatten(1)):
+        assert torch.equal(rows_of({WRIST_POSE: per_sample}, size, slice(1, 3))[WRIST_POSE], per_sample[1:3])
+    for of_all in (poses[0], poses[0].flatten()):
+        assert torch.equal(rows_of({WRIST_POSE: of_all}, size, slice(1, 3))[WRIST_POSE], of_all)
+
+
 def test_a_negative_size_is_refused():
     with pytest.raises(ValueError, match="micro_batch_size must be 0"):
         make_policy(micro_batch_size=-1)

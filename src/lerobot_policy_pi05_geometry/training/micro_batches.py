@@ -40,7 +40,7 @@ def rows_of(batch: Mapping[str, Any], size: int, rows: slice) -> dict[str, Any]:
 
     def per_sample(key: str, value: Any) -> bool:
         if isinstance(value, Tensor):
-            pose_of_all = key.startswith(CALIBRATION_PREFIX) and value.ndim == 2  # (4, 4), once for the batch
+            pose_of_all = key.startswith(CALIBRATION_PREFIX) and value.shape in ((4, 4), (16,))  # once for the batch
             return value.ndim > 0 and value.shape[0] == size and not pose_of_all
         return isinstance(value, list | tuple) and len(value) == size
 
