@@ -183,7 +183,7 @@ def kept(policy: PI05GeometryPolicy, optimizer: torch.optim.Optimizer | None) ->
     tables = [
         moment.qmap for values in optimizer.state.values() for moment in values.values() if hasattr(moment, "qmap")
     ]
-    return [*state, *tables, *policy._previous]
+    return [*state, *tables, *policy.update_size.previous]
 
 
 def main() -> None:

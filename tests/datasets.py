@@ -31,7 +31,7 @@ def write_dataset(
     dataset = LeRobotDataset.create(REPO_ID, fps=FPS, features=features, root=root, use_videos=videos)
     _record(dataset, lengths, size, seed)
     dataset.finalize()
-    write_frame_quantiles(root, REPO_ID)
+    write_frame_quantiles(root, REPO_ID, ("observation.state", "action"))
     return root
 
 

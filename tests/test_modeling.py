@@ -1,6 +1,7 @@
 """The policy in training and on disk: losses, noise, parameter groups, checkpoints, and what it refuses."""
 
 import copy
+import math
 
 import pytest
 import torch
@@ -59,6 +60,61 @@ def test_per_sample_losses_have_the_mean_loss_as_their_mean(padded, flow_samples
     torch.testing.assert_close((each * valid).sum() / valid.sum(), mean)
     assert info["loss"] == pytest.approx(mean.item())
     each.mean().backward()
+
+
+@pytest.mark.parametrize("micro_batch_size", [None, 2])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_an_action_that_is_no_number_stops_before_a_gradient(bad, micro_batch_size):
+    """One NaN in one frame turned every weight NaN, and the run went on to its end."""
+    policy, batch = make_policy(micro_batch_size=micro_batch_size).train(), make_batch(3)
+    batch["index"] = torch.tensor([11, 507, 12])
+    batch["action"][1, 4, 2] = bad
+    told = rf"action\[2\] is {bad}, 4 frames after the frame with dataset index 507"
+    for reduction in ("mean", "none"):
+        with pytest.raises(ValueError, match=told):
+            policy.forward(batch, reduction=reduction)
+    assert all(p.grad is None for p in policy.parameters())
+    del batch["index"]
+    with pytest.raises(ValueError, match=r"4 frames after sample 1 of the batch"):
+        policy.forward(batch)
+
+
+@pytest.mark.parametrize("micro_batch_size", [None, 2])
+def test_a_loss_that_is_no_number_stops_too(micro_batch_size):
+    """Whatever it comes from: here an image, of which only the first of an episode is checked."""
+    policy, batch = make_policy(micro_batch_size=micro_batch_size), make_batch(3)  # no dropout of this camera
+    policy.forward(batch)
+    batch[FRONT][2] = math.nan
+    with pytest.raises(FloatingPointError, match=rf"dataset index {batch['index'][2]} is not finite \(1 of 3 samples"):
+        policy.forward(batch)
+
+
+def test_a_sample_of_padding_alone_has_no_loss():
+    policy, batch = make_policy().train(), make_batch(3)
+    batch["action_is_pad"] = torch.zeros(3, CHUNK, dtype=torch.bool)
+    batch["action_is_pad"][1] = True
+    each, info = policy.forward(batch, reduction="none")
+    assert each[1] == 0
+    assert each[[0, 2]].gt(0).all()
+    assert math.isfinite(info["loss"])
+    batch["action_is_pad"][:] = True
+    mean, info = policy.forward(batch)
+    assert mean == 0 == info["loss"]
+    mean.backward()
+    assert all(p.grad.isfinite().all() for p in policy.parameters() if p.grad is not None)
+
+
+@pytest.mark.parametrize("reduction", ["mean", "none"])
+def test_padded_steps_count_if_they_are_to_be_supervised(reduction):
+    batch = make_batch(2)
+    batch["action_is_pad"] = torch.arange(CHUNK) >= torch.tensor([[CHUNK], [2]])
+    supervised, masked = (
+        make_policy(padded_actions=choice).train().forward(batch, reduction=reduction)[0]
+        for choice in ("supervised", "masked")
+    )
+    everything, _ = make_policy().train().forward(without(batch, "action_is_pad"), reduction=reduction)
+    assert torch.equal(supervised, everything)
+    assert not torch.isclose(supervised.mean(), masked.mean())
 
 
 def test_an_unknown_reduction_is_refused():

@@ -6,6 +6,7 @@ import pytest
 import torch
 from lerobot.processor import PolicyProcessorPipeline
 
+from lerobot_policy_pi05_geometry.data.relative_actions import ACTION_ANCHOR
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from lerobot_policy_pi05_geometry.processor_pi05_geometry import make_pi05_geometry_pre_post_processors
 from tests.entry_points import (
@@ -15,11 +16,14 @@ from tests.entry_points import (
     FRONT_DEPTH,
     GEOMETRY,
     STATE,
+    TOKENS,
     WRIST,
     WRIST_POSE,
     chunk_of,
+    make_batch,
     make_config,
     make_observation,
+    make_policy,
     make_processors,
     make_stats,
     redraw,
@@ -87,7 +91,7 @@ def test_actions_survive_normalising_and_back():
 
 
 @pytest.mark.parametrize("excluded", [[], ["gripper"]])
-def test_relative_actions_survive_the_way_there_and_back(excluded):
+def test_relative_actions_are_relative_to_the_policy_and_absolute_to_the_robot(excluded):
     names = ["x", "y", "z", "turn", "gripper"]
     config = make_config(use_relative_actions=True, relative_exclude_joints=excluded, action_feature_names=names)
     preprocessor, postprocessor = make_processors(config)
@@ -99,7 +103,71 @@ def test_relative_actions_survive_the_way_there_and_back(excluded):
     offset[..., ACTION_DIM - len(excluded) :] = 0.0
     expected = absolute(observation | {"action": action - offset})["action"]
     torch.testing.assert_close(processed["action"], expected)
-    torch.testing.assert_close(postprocessor(processed["action"]), action)
+    predicted = processed["action"] + processed[ACTION_ANCHOR][:, None]  # as the policy hands out a chunk
+    torch.testing.assert_close(postprocessor(predicted), action)
+
+
+@pytest.mark.parametrize("arriving", [0.25, 0.251, -3.0, 1e6])
+def test_a_state_dimension_without_width_is_written_as_its_constant(arriving):
+    """0.001 beside the constant turned the prompt's number from 0 to 255."""
+    config = make_config()
+    config.validate_features()
+    stats = make_stats()
+    for name in ("q01", "q99", "min", "max"):
+        stats[STATE][name] = (
+            stats[STATE].get(name, stats[STATE][name.replace("min", "q01").replace("max", "q99")]).clone()
+        )
+        stats[STATE][name][3] = 0.25
+    preprocessor, _ = make_pi05_geometry_pre_post_processors(config, stats)
+    observation = make_observation()
+    constant = observation[STATE].clone()
+    constant[:, 3] = 0.25
+    expected = preprocessor(observation | {STATE: constant})
+    other = constant.clone()
+    other[:, 3] = arriving
+    found = preprocessor(observation | {STATE: other})
+    assert torch.equal(found[TOKENS], expected[TOKENS])
+    assert found["task"][0].split("State: ")[1].split(" ")[3] == "0"  # as LeRobot's pi05 writes it in training
+    other[:, 2] = -other[:, 2]
+    assert not torch.equal(preprocessor(observation | {STATE: other})[TOKENS], expected[TOKENS])
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+def test_a_state_with_width_is_normalised_to_the_bit_as_without_the_probe(scale):
+    config = make_config()
+    config.validate_features()
+    stats = make_stats()
+    stats[STATE] = {name: value * scale for name, value in stats[STATE].items()}
+    preprocessor, _ = make_pi05_geometry_pre_post_processors(config, stats)
+    (normaliser,) = (step for step in preprocessor.steps if hasattr(step, "norm_map"))
+    observation = make_observation()
+    observation[STATE] = observation[STATE] * scale
+    expected = PolicyProcessorPipeline([normaliser])({STATE: observation[STATE]})[STATE]
+    assert torch.equal(preprocessor(observation)[STATE], expected)
+
+
+# --- another robot ------------------------------------------------------------------------------------------------
+
+
+def test_a_robot_with_other_joints_is_refused_in_one_sentence(tmp_path):
+    preprocessor, _ = make_processors(make_config())
+    action = torch.zeros(2, CHUNK, ACTION_DIM)
+    preprocessor(make_observation() | {"action": action})  # training
+    preprocessor.save_pretrained(tmp_path)
+    loaded = PolicyProcessorPipeline.from_pretrained(tmp_path, config_filename="policy_preprocessor.json")
+    observation = make_observation()
+    assert torch.equal(loaded(dict(observation))[STATE], preprocessor(dict(observation))[STATE])
+    observation[STATE] = torch.zeros(2, 9)
+    with pytest.raises(ValueError, match=r"^observation.state has 9 dimensions, but this policy was trained with 7"):
+        loaded(observation)
+
+
+def test_another_robots_actions_are_refused_in_training():
+    policy = make_policy().train()
+    batch = make_batch()
+    batch["action"] = batch["action"][..., :4]
+    with pytest.raises(ValueError, match="batch has 4 action dimensions, but the policy has 5"):
+        policy.forward(batch)
 
 
 def test_keys_can_be_renamed_depth_included(tmp_path):

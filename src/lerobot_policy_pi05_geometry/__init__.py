@@ -18,7 +18,10 @@ processor steps and the environment type `metaworld_rgbd` with LeRobot, which im
 from typing import TYPE_CHECKING, Any
 
 from .configuration_pi05_geometry import PI05GeometryConfig
-from .data.prompt import PortableTokenizerProcessorStep, PromptProcessorStep
+from .data.normaliser_scale import NormaliserProbeStep, NormaliserScaleStep
+from .data.prompt import PromptProcessorStep
+from .data.state_width import StateWidthStep
+from .data.tokenizer import PortableTokenizerProcessorStep
 from .serving.remote.configuration_pi05_geometry_remote import PI05GeometryRemoteConfig
 from .sim.configuration import MetaworldRgbdEnv
 
@@ -28,11 +31,14 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "MetaworldRgbdEnv",
+    "NormaliserProbeStep",
+    "NormaliserScaleStep",
     "PI05GeometryConfig",
     "PI05GeometryPolicy",
     "PI05GeometryRemoteConfig",
     "PortableTokenizerProcessorStep",
     "PromptProcessorStep",
+    "StateWidthStep",
     "__version__",
 ]
 

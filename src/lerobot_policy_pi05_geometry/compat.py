@@ -1,6 +1,6 @@
 """Differences between LeRobot 0.6.1 and its main branch (0.6.2), in one place. Delete this file when 0.6.1 goes.
 
-What both versions accept is not here: `save_artifacts` of the tokenizer step (data/prompt.py) and `_fsdp_wrap_modules` of the
+What both versions accept is not here: `save_artifacts` of the tokenizer step (data/tokenizer.py) and `_fsdp_wrap_modules` of the
 policy are asked for by 0.6.2 and ignored by 0.6.1. The comparison was made with LeRobot's commit 7427f318.
 """
 

@@ -1,5 +1,6 @@
 """The policy's configuration: π0.5's, plus geometry. LeRobot finds it as `--policy.type=pi05_geometry`."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, get_args
@@ -11,7 +12,8 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from .configuration_checks import check_choices, check_dropout, check_numbers, rtc_mode
-from .data.prompt import PALIGEMMA_TOKENIZER, SMALL_TOKENIZER
+from .data.small_tokenizer import SMALL_TOKENIZER
+from .data.tokenizer import PALIGEMMA_TOKENIZER
 from .geometry.camera import CameraCalibration
 from .geometry.depth import METRES_PER_UNIT
 from .geometry.keys import (
@@ -39,11 +41,14 @@ from .training.dropout import DropoutRates
 from .training.optim import OPTIMIZERS, AdamW8bitConfig
 from .training.schedule import GateAwareScheduleConfig
 
+logger = logging.getLogger(__name__)
+
 EMPTY_CAMERA = f"{IMAGE_PREFIX}empty_camera_"
 DEFAULT_ENCODER = "depth-anything/DA3-BASE"
 
 SOURCES = ("none", "rgbd", "da3", "features")
 CONTROLS = ("random",)  # sources for comparison only, see model/ablations.py
+_NEVER_READ = (FeatureType.STATE, FeatureType.ENV)  # types of which the policy reads observation.state alone
 
 _CHOICES = {
     "optimizer": OPTIMIZERS,
@@ -62,6 +67,7 @@ _CHOICES = {
     "geometry_placement": get_args(GeometryPlacement),
     "geometry_expert": get_args(GeometryExpert),
     "geometry_tokens": ("statistics", "points"),
+    "padded_actions": ("masked", "supervised"),
 }
 
 
@@ -143,6 +149,10 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     time_sampling_offset: float = 0.001
     min_period: float = 4e-3
     max_period: float = 4.0
+
+    # Action steps after the end of an episode, which repeat its last action: masked (no loss), or supervised, as LeRobot's
+    # π0.5 does and `pi05-geometry convert` writes. Supervised teaches to hold still after the end of the task.
+    padded_actions: str = "masked"
 
     use_relative_actions: bool = False
     relative_exclude_joints: list[str] = field(default_factory=lambda: ["gripper"])
@@ -272,6 +282,11 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
                 raise ValueError(
                     f"absent_cameras names {key}, but the data has {cameras or 'no camera'}; give a whole key."
                 )
+        # What the policy does not read must not reach the normaliser, which would ask for its statistics.
+        unread = [key for key, feature in inputs.items() if feature.type in _NEVER_READ and key != OBS_STATE]
+        for key in unread:
+            logger.info("The policy does not read %s.", key)
+            del inputs[key]
         if OBS_STATE not in inputs:
             inputs[OBS_STATE] = PolicyFeature(type=FeatureType.STATE, shape=(self.max_state_dim,))
         self.input_features = inputs

@@ -1,4 +1,4 @@
-"""The policy: LeRobot's batches in, losses and actions out.
+"""The policy. It takes LeRobot's batches and returns losses and actions.
 
 ```
    batch ──► prepare_images ─► prefix ─┐
@@ -9,6 +9,7 @@
 """
 
 import logging
+import math
 from collections import deque
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -28,9 +29,11 @@ from torch import Tensor, nn
 from .compat import make_rtc_processor
 from .configuration_checks import refuse_log_gate, rtc_mode
 from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
-from .data.images import prepare_images
-from .data.prompt import SMALL_TOKENIZER, small_number_ids
-from .data.statistics import check_stats
+from .data.images import ImageRangeCheck, prepare_images
+from .data.relative_actions import anchor_of, relative_to
+from .data.small_tokenizer import SMALL_TOKENIZER, small_number_ids
+from .data.statistics import check_stats, require_matching_kind
+from .data.training_batch import check_actions, require_finite_losses, valid_steps
 from .geometry import GeometryEncoder
 from .geometry.da3 import Da3Encoder
 from .geometry.da3.weights import load_da3
@@ -45,22 +48,21 @@ from .training.attention_share import AttentionShare
 from .training.dropout import Cameras, drop
 from .training.lora import always_in_full, peft_targets
 from .training.micro_batches import each_of, require_whole_parameters, rows_of, sum_of
-from .training.parameter_groups import FULL_STATE, GATE_GROUP, NAME
+from .training.parameter_groups import UpdateSize, new_parameters, parameter_groups
 from .training.sharding import UNIT_CLASSES
 from .weight_files.files import find_file, require_policy_type
 from .weight_files.strict_load import load_strictly
 
 logger = logging.getLogger(__name__)
 
-GATE = ".geometry_gate."  # in the name of the gate's parameter
-_SHARE_EVERY = 20  # training steps between two looks at where the actions' attention lies
-_EVALUATION_STEP = -1  # evaluation loss draws the same noise at every training step, so that its curve is comparable
+_SHARE_EVERY = 20  # training steps between two measurements of the attention that actions give to geometry
+_EVALUATION_STEP = -1  # The evaluation loss draws the same noise at every training step, so that values are comparable.
 
 
 class TrainingProgress(nn.Module):
-    """Optimiser steps done, kept in the checkpoint: noise is keyed by them (see model/flow_matching.py).
+    """The number of optimiser steps done. It is saved in the checkpoint: noise is keyed by it (model/flow_matching.py).
 
-    A module, so that PEFT can save it.
+    It is a module, since PEFT saves modules only.
     """
 
     def __init__(self) -> None:
@@ -84,16 +86,19 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         encoder: Da3Encoder | None = None,
         **_: Any,
     ) -> None:
-        """dataset_stats, dataset_meta: what LeRobot's `make_policy` passes; the rest of it is not needed.
+        """dataset_stats, dataset_meta: as LeRobot's `make_policy` passes them; its other arguments are not needed.
 
-        encoder: what `load_da3` returned for this configuration, for a policy that runs the encoder itself (da3, or features
-        without a dataset); None: it is loaded here.
+        encoder: the Depth Anything 3 encoder that `load_da3` returned for this configuration, for a policy that computes
+        geometry from RGB (da3, or features without a dataset). None: it is loaded here.
+        Raises ValueError if the statistics do not fit the configuration (data/statistics.py).
         """
         super().__init__(config)
         refuse_log_gate(config)
         config.validate_features()
         if dataset_stats:
             check_stats(config, dataset_stats)
+        if dataset_meta is not None:
+            require_matching_kind(config, dataset_meta)
         self.config: PI05GeometryConfig = config
         self.model = PI05Pytorch(config.network())
         self.init_rtc_processor()
@@ -108,9 +113,10 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             self.model.gradient_checkpointing_enable()
         self.progress = TrainingProgress()
         self._noise_seed = torch.initial_seed()
-        self._last_update: dict[str, Tensor] = {}
+        self.update_size = UpdateSize()
         self._last_share: Tensor | None = None
-        if not self.model.action_in_proj.weight.is_meta:  # from_pretrained fills the weights first
+        self._image_range = ImageRangeCheck()
+        if not self.model.action_in_proj.weight.is_meta:  # Meta tensors get their values in from_pretrained.
             self._warn_of_random_weights()
             self.to(config.device)
         self.reset()
@@ -118,7 +124,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def _set_trainable(self) -> None:
         network = self.model.paligemma_with_expert
         network.set_trainable(self.config.train_expert_only, self.config.freeze_vision_encoder)
-        # A policy without RGB runs no vision tower, so it must not wait for its gradient.
+        # A policy without RGB does not run the vision tower, so DDP must not wait for its gradient.
         if all(key.startswith(EMPTY_CAMERA) for key in self.config.image_features):
             network.paligemma.model.vision_tower.requires_grad_(False)
             network.paligemma.model.multi_modal_projector.requires_grad_(False)
@@ -148,9 +154,10 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         strict: bool = True,
         **kwargs: Any,
     ) -> "PI05GeometryPolicy":
-        """Load a policy from a folder or the hub, in evaluation mode. Its weights load whole, or this raises.
+        """Load a policy from a folder or the hub, in evaluation mode.
 
-        strict: kept for LeRobot's signature; loading is always strict.
+        Every weight is loaded and every tensor of the file is used; otherwise this raises (weight_files/strict_load.py).
+        strict: part of LeRobot's signature; loading is always strict.
         """
         hub = {
             "force_download": force_download,
@@ -165,7 +172,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, **hub)
         live = ("da3", "features") if kwargs.get("dataset_meta") is None else ("da3",)
         if isinstance(config, PI05GeometryConfig) and config.geometry_source in live:
-            kwargs["encoder"] = load_da3(config)  # before, since in there every parameter becomes an empty one
+            kwargs["encoder"] = load_da3(config)  # Before init_empty_weights, which would make its parameters empty.
         with init_empty_weights(include_buffers=False):
             policy = cls(config, **kwargs)
         load_strictly(policy, weights)
@@ -179,11 +186,11 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         return self.progress.step
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        """LeRobot asks here what `--peft.*` trains."""
+        """What `--peft.*` trains. LeRobot calls this."""
         return peft_targets(self.config)
 
     def _validate_peft_config(self, peft_config: Any) -> None:
-        """LeRobot asks here about a PEFT configuration before it uses it; the new parameters are always trained."""
+        """Add the new parameters to what a PEFT configuration trains in full. LeRobot calls this before it uses one."""
         super()._validate_peft_config(peft_config)
         given = list(peft_config.modules_to_save or [])
         peft_config.modules_to_save = given + [name for name in always_in_full(self.config) if name not in given]
@@ -191,34 +198,39 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     # --- training -------------------------------------------------------------------------------------------------
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
-        """Flow-matching loss of a training batch, over the action steps that are no padding.
+        """Flow-matching loss of a training batch.
 
-        reduction: "mean" for a scalar, "none" for (B,), as LeRobot's sample weighting wants it.
+        batch: `action` (B, S, A) normalised, what the preprocessor makes of an observation, and, where there are padded
+        steps, `action_is_pad` (B, S). `padded_actions` of the configuration says whether those count.
+        reduction: "mean" for a scalar, "none" for (B,), which LeRobot's sample weighting needs. A sample without a valid
+        step has the loss 0.
         Returns the loss and a dict of numbers to log.
+        Raises ValueError or FloatingPointError if an action or a loss is not finite (data/training_batch.py).
         """
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction must be 'mean' or 'none', got {reduction!r}.")
-        device = self.training_step.device
-        size, steps = batch[ACTION].shape[:2]
+        size, steps, action_dim = batch[ACTION].shape
+        check_actions(batch[ACTION], batch, self.config.action_feature.shape[0])
+        self._anchor(batch)  # whether the processors agree with the policy
+        self._check_images(batch)
         draw = self._draw(batch, torch.Size((size, steps, self.config.max_action_dim)))
-        is_pad = batch.get("action_is_pad")
-        valid = torch.ones(size, steps, dtype=torch.bool, device=device) if is_pad is None else ~is_pad  # (B, S)
+        valid = valid_steps(batch[ACTION], batch.get("action_is_pad"), self.config.padded_actions)  # (B, S)
         if self.config.rtc_training_max_delay:  # a hard prefix is no target; one valid step remains
-            delay = torch.minimum(draw.delay.to(device), (valid.sum(dim=1) - 1).clamp_min(0))  # (B,)
+            delay = torch.minimum(draw.delay.to(valid.device), (valid.sum(dim=1) - 1).clamp_min(0))  # (B,)
             draw = draw._replace(delay=delay)
-            valid = valid & (torch.arange(steps, device=device) >= delay[:, None])
-        action_dim = self.config.action_feature.shape[0]
+            valid = valid & (torch.arange(steps, device=valid.device) >= delay[:, None])
+        count = valid.sum().clamp_min(1)
         seen: list[Tensor] = []
 
         def part(rows: slice) -> Tensor:
-            """Share of some rows in the mean of all, or their losses one by one."""
+            """What some rows add to the mean of all, or their losses one by one."""
             flow = FlowDraw(*(drawn[rows] for drawn in draw))
             losses = self._losses(rows_of(batch, size, rows), flow)[..., :action_dim]
             losses = losses.masked_fill(~valid[rows][..., None], 0.0)
             seen.append(losses.detach())
             if reduction == "none":
-                return losses.sum(dim=(1, 2)) / (valid[rows].sum(dim=1) * action_dim)
-            return losses.sum() / (valid.sum() * action_dim)
+                return losses.sum(dim=(1, 2)) / (valid[rows].sum(dim=1).clamp_min(1) * action_dim)
+            return losses.sum() / (count * action_dim)
 
         share = self._attention_share()
         with nullcontext() if share is None else share.measuring():
@@ -226,15 +238,17 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if share is not None:
             self._last_share = share.mean()
         losses = torch.cat(seen)  # (B, S, action_dim)
-        info: dict[str, Any] = {"loss": (losses.sum() / (valid.sum() * action_dim)).item()}
-        info["loss_per_dim"] = (losses.sum(dim=(0, 1)) / valid.sum()).tolist()
+        info: dict[str, Any] = {"loss": (losses.sum() / (count * action_dim)).item()}
+        if not math.isfinite(info["loss"]):
+            require_finite_losses(losses, batch)
+        info["loss_per_dim"] = (losses.sum(dim=(0, 1)) / count).tolist()
         info.update(self._geometry_info())
         return loss, info
 
     def _geometry_info(self) -> dict[str, float]:
         """Whether geometry is taken up, in percent: LeRobot logs three digits behind the point."""
         gate = self.model.paligemma_with_expert.geometry_gate
-        found = dict(self._last_update)
+        found = self.update_size.to_log()
         if gate is not None:
             found["gate_openness_pct"] = gate.mean_openness()
         if self._last_share is not None:
@@ -250,7 +264,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         return AttentionShare(network, self.geometry.source.num_tokens) if now else None
 
     def _in_micro_batches(self, part: Callable[[slice], Tensor], size: int, reduction: str) -> Tensor:
-        """The sum of `part` over the rows of a batch, or its values put together, `micro_batch_size` rows at a time."""
+        """`part` of `micro_batch_size` rows at a time: the sum of its scalars, or its (b,) joined to (B,)."""
         step = self.config.micro_batch_size or size
         parts = [partial(part, slice(start, start + step)) for start in range(0, size, step)]
         if len(parts) == 1:
@@ -290,7 +304,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         return Cameras(images, self.geometry.source.cameras, self.geometry.source.across_views)
 
     def _draw(self, batch: dict[str, Tensor], shape: torch.Size) -> FlowDraw:
-        """Noise, flow time and dropout draws, keyed by (seed, step, dataset index); by the row where there is no index."""
+        """Draw noise, flow time and dropout, keyed by (seed, step, dataset index), or by the row if there is no index."""
         index = batch.get("index")
         indices = list(range(shape[0])) if index is None else [int(i) for i in index.flatten().tolist()]
         return draw_flow(
@@ -307,51 +321,31 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         )
 
     def new_parameters(self) -> dict[str, nn.Parameter]:
-        """What π0.5 does not have: the adapter with its embeddings, and the gate."""
-        named = dict(self.named_parameters())
-        return {k: p for k, p in named.items() if k.startswith("geometry.") or GATE in k}
+        """The parameters that π0.5 does not have, by name: the adapter with its embeddings, and the gate."""
+        return new_parameters(self)
 
     def get_optim_params(self) -> list[dict[str, Any]]:
-        """Parameter groups: π0.5's, and the new parameters with rates of their own, their eps and no weight decay."""
-        new = {name: p for name, p in self.new_parameters().items() if p.requires_grad}
-        ids = {id(p) for p in new.values()}
-        groups: list[dict[str, Any]] = [
-            {"params": [p for p in self.parameters() if p.requires_grad and id(p) not in ids]}
-        ]
-        gate = [p for name, p in new.items() if GATE in name]
-        rest = [p for name, p in new.items() if GATE not in name]
-        common: dict[str, Any] = {"eps": self.config.geometry_eps, "weight_decay": 0.0}
-        if self.config.optimizer == "adamw8bit":
-            common[FULL_STATE] = True
-        if rest:
-            groups.append({"params": rest, "lr": self.config.geometry_lr, **common})
-        if gate:
-            groups.append({"params": gate, "lr": self.config.geometry_gate_lr, NAME: GATE_GROUP, **common})
-        return groups
+        """Parameter groups of the optimiser. LeRobot calls this."""
+        return parameter_groups(self, self.config)
 
     @torch.no_grad()
     def update(self) -> None:
-        """LeRobot calls this after every optimiser step: count it, and measure how far the new parameters moved."""
+        """Count an optimiser step, and measure how far the new parameters moved. LeRobot calls this after every step."""
         self.training_step.add_(1)
-        now = [p.detach().clone() for p in self.new_parameters().values() if p.requires_grad]
-        before = getattr(self, "_previous", None)
-        self._previous = now
-        if before and len(before) == len(now):
-            moved = torch.stack([(a - b).square().sum() for a, b in zip(now, before, strict=True)]).sum()
-            size = torch.stack([b.square().sum() for b in before]).sum()
-            self._last_update = {"geometry_update_pct": (moved / size.clamp_min(1e-12)).sqrt()}
+        self.update_size.measure([p for p in self.new_parameters().values() if p.requires_grad])
 
     # --- acting ---------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Start of an episode: forget the queued actions."""
+        """Start an episode: the queued actions are dropped, and the next images are checked."""
         self._action_queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+        self._image_range.reset()
         if self.geometry is not None:
             self.geometry.reset()
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """One action (B, action_dim) per call; a new chunk is predicted when the queue is empty."""
+        """The next action (B, action_dim), normalised and absolute. An empty queue is filled with a new chunk's actions."""
         if self.rtc_processor is not None and self.rtc_processor.rtc_config.enabled:
             raise RuntimeError(
                 "Real-time chunking works on whole chunks: call predict_action_chunk, not select_action."
@@ -366,13 +360,19 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """An action chunk (B, chunk_size, action_dim), normalised.
 
+        With `use_relative_actions` the network predicts differences to the state; here they become absolute actions, with
+        the state of this observation (data/relative_actions.py).
         kwargs: `noise` (B, S, max_action_dim), `num_steps`, `runner` (instead of the configured `inference_runner`), and
-        real-time chunking's `inference_delay`, `prev_chunk_left_over` and `execution_horizon`.
+        real-time chunking's `inference_delay`, `prev_chunk_left_over` (T, A), absolute, and `execution_horizon`.
         """
         self.eval()
+        self._check_images(batch)
+        anchor = self._anchor(batch)  # (B, A)
+        if anchor is not None and kwargs.get("prev_chunk_left_over") is not None:
+            kwargs["prev_chunk_left_over"] = relative_to(anchor, kwargs["prev_chunk_left_over"])
         images, img_masks = prepare_images(batch, self.config, self.training_step.device)
         geometry = None
-        if self.geometry is not None:  # measured beside vision and prefix
+        if self.geometry is not None:  # On a GPU it is measured on a stream of its own, beside vision and prefix.
             geometry = PendingGeometry(self.geometry.source.num_tokens, partial(self._measure, batch))
         actions = self.sampler(
             images,
@@ -382,7 +382,16 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             geometry=geometry,
             **{"runner": self.config.inference_runner, **kwargs},
         )
-        return actions[..., : self.config.action_feature.shape[0]]
+        actions = actions[..., : self.config.action_feature.shape[0]]
+        return actions if anchor is None else actions + anchor[:, None].to(actions)
+
+    def _check_images(self, batch: dict[str, Tensor]) -> None:
+        """Check the scale of the images, in the first batch after `reset`."""
+        self._image_range(batch, self.config)
+
+    def _anchor(self, batch: dict[str, Tensor]) -> Tensor | None:
+        """What to add to relative actions, (B, A); None for absolute ones."""
+        return anchor_of(batch, self.config.use_relative_actions)
 
     def _measure(self, batch: dict[str, Tensor]) -> GeometryTokens:
         assert self.geometry is not None
@@ -393,7 +402,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         return True
 
     def init_rtc_processor(self) -> None:
-        """LeRobot calls this after setting `config.rtc_config`."""
+        """Set up real-time chunking. LeRobot calls this after it has set `config.rtc_config`."""
         rtc, mode = self.config.rtc_config, rtc_mode(self.config)
         trained = self.config.rtc_training_max_delay > 0
         self.rtc_processor = None if rtc is None else make_rtc_processor(rtc, trained)

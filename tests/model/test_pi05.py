@@ -278,6 +278,33 @@ def test_causal_geometry_is_another_model() -> None:
     assert distance(sample(network, batch, geom_att=[1] * cells), sample(network, batch)) > 1e-3
 
 
+@pytest.mark.parametrize("dtype", [torch.bool, torch.int64, torch.float32])
+@pytest.mark.parametrize("batched", [False, True])
+@pytest.mark.parametrize("causal", [False, True])
+def test_geom_att_may_be_a_tensor(dtype, batched, causal):
+    """As other π0.5 code bases pass it: (G,), or (B, G) with equal rows."""
+    network = build_network(SEGMENT)
+    batch = Case(seed=5, batch=2).draw(network.geometry_width)
+    cells = batch.geom_embs.shape[1]
+    entries = [1] * cells if causal else one_block(cells)
+    given_att = torch.tensor(entries, dtype=dtype)
+    given_att = given_att.expand(2, -1) if batched else given_att
+    assert torch.equal(sample(network, batch, geom_att=given_att), sample(network, batch, geom_att=entries))
+    assert torch.equal(network(*batch, geom_att=given_att), network(*batch, geom_att=entries))
+
+
+def test_geom_att_with_other_rows_or_another_length_is_refused():
+    network = build_network(SEGMENT)
+    batch = Case(seed=5, batch=2).draw(network.geometry_width)
+    cells = batch.geom_embs.shape[1]
+    rows = torch.tensor([one_block(cells), [1] * cells])
+    with pytest.raises(ValueError, match="geom_att must have equal rows"):
+        network(*batch, geom_att=rows)
+    for wrong in (one_block(cells + 1), torch.tensor(one_block(cells + 1))):
+        with pytest.raises(ValueError, match=rf"one entry for each of the {cells} geometry tokens, got {cells + 1}"):
+            network(*batch, geom_att=wrong)
+
+
 # --- the public methods -----------------------------------------------------------------------------------------------
 
 

@@ -57,7 +57,7 @@ def trained(policy: PI05GeometryPolicy, batch: dict) -> int:
         policy.update()
 
     step()
-    before = storage_bytes([*policy.parameters(), *policy.buffers(), *batch.values(), *policy._previous])
+    before = storage_bytes([*policy.parameters(), *policy.buffers(), *batch.values(), *policy.update_size.previous])
     return before + sum(state_bytes(optimizer)) + allocated(step)
 
 

@@ -12,11 +12,25 @@ from .app import app, console
 @app.command()
 def quantiles(
     dataset_root: Annotated[Path, typer.Option("--dataset.root", help="Folder of a LeRobotDataset.")],
+    actions: Annotated[
+        bool, typer.Option("--actions", help="The actions too, as absolute ones, and not the state alone.")
+    ] = False,
+    full_range: Annotated[
+        list[str] | None,
+        typer.Option(help="<feature>:<dimension>, such as action:6: its quantiles become its minimum and maximum."),
+    ] = None,
 ) -> None:
-    """Recompute a dataset's state and action quantiles over all frames (LeRobot averages those of single episodes)."""
+    """Recompute a dataset's state quantiles over all frames (LeRobot averages those of single episodes)."""
     from ..data.quantiles import write_frame_quantiles
 
-    for key, shares in write_frame_quantiles(dataset_root).items():
+    wanted: dict[str, list[int]] = {}
+    for given in full_range or []:
+        key, _, dim = given.rpartition(":")
+        if not key or not dim.isdigit():
+            raise ValueError(f"--full-range needs <feature>:<dimension>, such as action:6, but got '{given}'.")
+        wanted.setdefault(key, []).append(int(dim))
+    keys = ("observation.state", "action") if actions else ("observation.state",)
+    for key, shares in write_frame_quantiles(dataset_root, keys=keys, full_range=wanted).items():
         text = " -> ".join(" ".join(f"{share:.0%}" for share in row) for row in shares)
         console.print(f"{key}: q01 to q99 covers of min to max, per dimension: {text}")
 

@@ -12,6 +12,8 @@ from ..geometry.images import rgb_image
 if TYPE_CHECKING:
     from ..configuration_pi05_geometry import PI05GeometryConfig
 
+_TOLERANCE = 0.02  # what resizing with cubic interpolation or a video codec may overshoot
+
 
 def prepare_images(
     batch: Mapping[str, Tensor], config: "PI05GeometryConfig", device: torch.device
@@ -37,6 +39,37 @@ def prepare_images(
         images.append(None if absent else _prepare_image(batch[key].to(device), key, config))
         masks.append(torch.full((size,), not absent, device=device))
     return images, masks
+
+
+class ImageRangeCheck:
+    """Checks once per episode, and once per training run, that float images are in [0, 1].
+
+    Images in 0..255 or in [-1, 1] have the right shape and type, so nothing else would notice them.
+    """
+
+    def __init__(self) -> None:
+        self._done = False
+
+    def reset(self) -> None:
+        """Check the next batch again."""
+        self._done = False
+
+    def __call__(self, batch: Mapping[str, Tensor], config: "PI05GeometryConfig") -> None:
+        """Raises ValueError naming the camera and what its values say about their scale."""
+        if self._done:
+            return
+        for key in config.image_features:
+            if key in batch and batch[key].dtype != torch.uint8 and batch[key].numel():
+                _require_unit_range(batch[key], key)
+        self._done = True
+
+
+def _require_unit_range(image: Tensor, key: str) -> None:
+    low, high = (bound.item() for bound in image.aminmax())
+    if low >= -_TOLERANCE and high <= 1 + _TOLERANCE:  # false for NaN
+        return
+    hint = " (was it scaled to 0..255?)" if high > 2 else " (was it scaled to [-1, 1]?)" if low < 0 else ""
+    raise ValueError(f"{key} has values from {low:g} to {high:g}{hint}; give images as uint8, or as floats in [0, 1].")
 
 
 def _prepare_image(image: Tensor, key: str, config: "PI05GeometryConfig") -> Tensor:

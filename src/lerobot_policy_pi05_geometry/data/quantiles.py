@@ -1,13 +1,13 @@
-"""Quantiles of a dataset over all its frames.
+"""Quantiles of a dataset over all its frames, and what kind of actions its statistics describe.
 
 LeRobot 0.6 keeps q01 and q99 of every episode and averages them (`datasets/compute_stats.py`). A joint or a hand that
 stands elsewhere in every episode then gets a range much narrower than its own, and what lies outside is clipped before
 the state is written into the prompt: the policy does not learn where the hand is.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from lerobot.datasets.compute_stats import get_feature_stats
@@ -17,30 +17,98 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from pyarrow import dataset as tables
 
 WIDE_ENOUGH = 0.5  # share of min..max that q01..q99 covers, below which check_stats warns
+_LOW, _HIGH = ("q01", "q10"), ("q90", "q99")
 
 
-def write_frame_quantiles(root: Path, repo_id: str = "local/dataset") -> dict[str, np.ndarray]:
-    """Recompute the statistics of state and action over all frames and write them to the dataset's meta/stats.json.
+def write_frame_quantiles(
+    root: Path,
+    repo_id: str = "local/dataset",
+    keys: Sequence[str] = (OBS_STATE,),
+    full_range: Mapping[str, Sequence[int]] | None = None,
+) -> dict[str, np.ndarray]:
+    """Recompute the statistics of some features over all frames and write them to the dataset's meta/stats.json.
 
+    keys: features to recompute, with the values as they are in the frames. For actions these are absolute ones.
+    full_range: dimensions of features whose quantiles become their minimum and maximum, for a dimension that hardly moves.
     Returns, per feature, the share of min..max that q01..q99 covered before and covers now, (2, D).
-    Raises FileNotFoundError if there is no dataset at `root`.
+    Raises FileNotFoundError if there is no dataset at `root`, ValueError if its action statistics are of relative actions
+    and `keys` names actions, or `full_range` names what is not there.
     """
-    if not (Path(root) / "meta" / "info.json").is_file():
+    root = Path(root)
+    if not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{root} holds no LeRobotDataset (meta/info.json is missing).")
     meta = LeRobotDatasetMetadata(repo_id, root=root)
+    if ACTION in keys and action_kind(meta) == "relative":
+        raise ValueError(
+            f"The action statistics of {root} are of relative actions (use_relative_actions), computed over whole chunks; "
+            "leave them as they are, or first make them absolute again with `lerobot-edit-dataset --operation.type "
+            "recompute_stats`."
+        )
     stats = dict(meta.stats or {})
-    table = tables.dataset(str(Path(root) / "data"), format="parquet")
-    shares = {}
-    for key in (OBS_STATE, ACTION):
-        if key not in meta.features:
-            continue
-        column = table.to_table(columns=[key])[key].to_numpy()
-        frames = np.stack(column).astype(np.float64).reshape(len(column), -1)  # (frames, D)
-        before = stats.get(key, {})
-        stats[key] = {**before, **get_feature_stats(frames, axis=0, keepdims=False)}
-        shares[key] = np.stack([covered(before), covered(stats[key])]) if "q01" in before else covered(stats[key])[None]
-    write_stats(stats, Path(root))
-    return shares
+    before = {key: stats[key] for key in (*keys, *(full_range or {})) if key in stats}
+    table = tables.dataset(str(root / "data"), format="parquet")
+    changed = []
+    for key in keys:
+        if key in meta.features:
+            column = table.to_table(columns=[key])[key].to_numpy()
+            frames = np.stack(column).astype(np.float64).reshape(len(column), -1)  # (frames, D)
+            stats[key] = {**stats.get(key, {}), **get_feature_stats(frames, axis=0, keepdims=False)}
+            changed.append(key)
+    for key, dims in (full_range or {}).items():
+        stats[key] = _with_full_range(key, stats, dims)
+        changed.append(key)
+    write_stats(stats, root)
+    return {
+        key: np.stack([covered(before[key]), covered(stats[key])])
+        if "q01" in before.get(key, {})
+        else covered(stats[key])[None]
+        for key in dict.fromkeys(changed)
+    }
+
+
+def _with_full_range(key: str, stats: Mapping[str, Mapping[str, Any]], dims: Sequence[int]) -> dict[str, Any]:
+    """The statistics of a feature, in some dimensions with the minimum as low and the maximum as high quantiles."""
+    found = {name: np.array(value, dtype=np.float64) for name, value in stats.get(key, {}).items()}
+    missing = sorted({"min", "max", "q01", "q99"} - set(found))
+    if missing:
+        raise ValueError(
+            f"{key} has no {'/'.join(missing)} statistics, so its range cannot be set; compute them first."
+        )
+    width = len(found["min"])
+    for dim in dims:
+        if not 0 <= dim < width:
+            raise ValueError(f"{key} has dimensions 0 to {width - 1}, so {key}:{dim} is none of them.")
+        for names, source in ((_LOW, "min"), (_HIGH, "max")):
+            for name in names:
+                if name in found:
+                    found[name][dim] = found[source][dim]
+    return found
+
+
+def action_kind(meta: Any) -> Literal["absolute", "relative"] | None:
+    """Whether a dataset's action statistics are of absolute or of relative actions; None if that cannot be told.
+
+    LeRobot's `recompute_stats` with `relative_action` replaces the dataset's statistics and leaves those of its episodes,
+    which are of the recorded, absolute actions. So statistics whose minimum and maximum are the episodes' are absolute.
+    """
+    stats = (getattr(meta, "stats", None) or {}).get(ACTION, {})
+    if not {"min", "max"} <= set(stats):
+        return None
+    folder = Path(meta.root) / "meta" / "episodes"
+    if not folder.is_dir():
+        return None
+    table = tables.dataset(str(folder), format="parquet")
+    columns = [f"stats/{ACTION}/min", f"stats/{ACTION}/max"]
+    if not set(columns) <= set(table.schema.names):
+        return None
+    lows, highs = (np.stack(table.to_table(columns=[name])[name].to_pylist()) for name in columns)  # (episodes, D)
+    low, high = lows.min(axis=0), highs.max(axis=0)
+    given_low, given_high = (np.asarray(stats[name], dtype=np.float64).reshape(-1) for name in ("min", "max"))
+    if given_low.shape != low.shape:
+        return None
+    tolerance = 1e-3 * (high - low) + 1e-6
+    same = (np.abs(given_low - low) <= tolerance) & (np.abs(given_high - high) <= tolerance)
+    return "absolute" if same.all() else "relative"
 
 
 def covered(stats: Mapping[str, Any], low_name: str = "q01", high_name: str = "q99") -> np.ndarray:

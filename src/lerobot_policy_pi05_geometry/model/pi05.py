@@ -19,7 +19,7 @@ from .precision import Float32Linear, compute_in
 from .real_time_chunking import HardPrefix, make_hard_prefix, require_delay
 from .segment_cache import SegmentKVCache
 from .segment_mask import segment_mask
-from .segments import AttMasks, Segment, SegmentTokens, one_block, segment_positions
+from .segments import AttMasks, Segment, SegmentTokens, att_masks_of, one_block, segment_positions
 
 
 class PI05Pytorch(nn.Module):
@@ -115,7 +115,7 @@ class PI05Pytorch(nn.Module):
         time: Tensor,
         geom_embs: Tensor | None = None,
         geom_pad: Tensor | None = None,
-        geom_att: AttMasks | None = None,
+        geom_att: AttMasks | Tensor | None = None,
         delay: Tensor | None = None,
     ) -> Tensor:
         """Flow-matching loss of every action entry, unreduced, in the shape of `noise`, float32.
@@ -123,8 +123,8 @@ class PI05Pytorch(nn.Module):
         actions: (B, S, D). noise: (B, S, D) and time: (B,), or (B, K, S, D) and (B, K): K flow samples of the same
         observation share one pass over prefix and geometry, blind to each other and all at the same positions.
         geom_embs: (B, G, W) tokens of the geometry adapter, geom_pad: (B, G) bool, False for a hole, geom_att: G
-        entries, one block by default. delay: (B,) int64, the first steps that are given clean, at flow time 0, as in trained RTC;
-        their entries of the result are no loss. The rest as in `embed_prefix`.
+        entries, or a tensor (G,) or (B, G) with equal rows; one block by default. delay: (B,) int64, the first steps that are
+        given clean, at flow time 0, as in trained RTC; their entries of the result are no loss. The rest as in `embed_prefix`.
         """
         samples = noise.shape[1] if noise.ndim == 4 else 1
         # Every flow time has a geometry of its own, so the samples cannot share it.
@@ -157,7 +157,7 @@ class PI05Pytorch(nn.Module):
         num_steps: int | None = None,
         geom_embs: Tensor | None = None,
         geom_pad: Tensor | None = None,
-        geom_att: AttMasks | None = None,
+        geom_att: AttMasks | Tensor | None = None,
         use_cache: bool = True,
         inference_delay: int | None = None,
         prev_chunk_left_over: Tensor | None = None,
@@ -246,7 +246,7 @@ class PI05Pytorch(nn.Module):
         masks: Tensor,
         geom_embs: Tensor | None,
         geom_pad: Tensor | None,
-        geom_att: AttMasks | None,
+        geom_att: AttMasks | Tensor | None,
     ) -> tuple[SegmentTokens, SegmentTokens | None]:
         """The two segments that do not depend on the actions."""
         prefix = self.embed_prefix(images, img_masks, tokens, masks)
@@ -256,7 +256,7 @@ class PI05Pytorch(nn.Module):
         return (prefix.followed_by(geometry), None) if self.geometry_in_prefix else (prefix, geometry)
 
     def embed_geometry(
-        self, geom_embs: Tensor, geom_pad: Tensor | None = None, geom_att: AttMasks | None = None
+        self, geom_embs: Tensor, geom_pad: Tensor | None = None, geom_att: AttMasks | Tensor | None = None
     ) -> SegmentTokens:
         """Geometry tokens as a segment, with zeros in padded slots; arguments as in `forward`."""
         if self.config.geometry is None:
@@ -268,9 +268,9 @@ class PI05Pytorch(nn.Module):
         pad = (
             torch.ones(geom_embs.shape[:2], dtype=torch.bool, device=geom_embs.device) if geom_pad is None else geom_pad
         )
-        return SegmentTokens(
-            _silence(geom_embs, pad), pad, one_block(geom_embs.shape[1]) if geom_att is None else geom_att
-        )
+        length = geom_embs.shape[1]
+        att = one_block(length) if geom_att is None else att_masks_of(geom_att, length)
+        return SegmentTokens(_silence(geom_embs, pad), pad, att)
 
     def _prefill(self, prefix: SegmentTokens, geometry: SegmentTokens | None, suffix_length: int) -> SegmentKVCache:
         """Run prefix and (clean) geometry once, and store their keys and values."""

@@ -34,6 +34,22 @@ class Segment(IntEnum):
 AttMasks = Sequence[int]
 
 
+def att_masks_of(given: Sequence[int] | Tensor, length: int) -> list[int]:
+    """A segment's `att_masks` as a list.
+
+    given: `length` entries, or a tensor (length,) or (B, length) as other π0.5 code bases pass it.
+    Raises ValueError for another length, and for a tensor whose rows differ: a segment has one mask for the whole batch.
+    """
+    if isinstance(given, Tensor):
+        rows = given.reshape(1, -1) if given.ndim < 2 else given.flatten(0, -2)
+        if (rows != rows[:1]).any():
+            raise ValueError("geom_att must have equal rows: every sample of a batch has the same blocks.")
+        given = rows[0].tolist()
+    if len(given) != length:
+        raise ValueError(f"geom_att needs one entry for each of the {length} geometry tokens, got {len(given)}.")
+    return [int(entry) for entry in given]
+
+
 def one_block(length: int) -> list[int]:
     """`att_masks` of a segment that opens a block of its own: 1 0 0 ... (empty for no tokens)."""
     return [1] + [0] * (length - 1) if length else []

@@ -54,6 +54,12 @@ class PlannedPolicy(PI05GeometryPolicy):
             source = StoredFeatures(cameras, config.geometry_grid, encoder.variant.feature_dim, optional)
         self.geometry = PlannedGeometry(source, self.model.geometry_width)
 
+    def _anchor(self, batch: dict[str, Tensor]) -> Tensor | None:
+        return None  # planned batches are made without processors
+
+    def _check_images(self, batch: dict[str, Tensor]) -> None:
+        """Nothing: the images have no values."""
+
     def loss(self, batch: dict[str, Tensor], whole: int) -> Tensor:
         """The share of these rows in the loss of a batch of `whole` samples."""
         size, steps = batch["action"].shape[:2]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from datasets.utils.logging import disable_progress_bar
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION, OBS_STATE
 
 from ..data.quantiles import write_frame_quantiles
 from ..geometry.dataset_calibration import write_dataset_calibration
@@ -85,7 +86,7 @@ def record(
                 )
             yield done, frames is not None
         dataset.finalize()
-        write_frame_quantiles(unfinished, repo_id)
+        write_frame_quantiles(unfinished, repo_id, (OBS_STATE, ACTION))
         write_dataset_calibration(unfinished, environment.calibration)
         unfinished.rename(root)
     finally:

@@ -21,7 +21,7 @@ from lerobot.processor import (
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from lerobot_policy_pi05_geometry.data.prompt import build_small_tokenizer
+from lerobot_policy_pi05_geometry.data.small_tokenizer import build_small_tokenizer
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from tests.entry_points import (
     ACTION_DIM,

@@ -6,10 +6,19 @@ import pytest
 import torch
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
+from lerobot.processor import RelativeActionsProcessorStep
 from safetensors.torch import load_file
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.checkpoint.conversion import GeometryStart, convert, export
+from lerobot_policy_pi05_geometry.checkpoint.conversion.steps import (
+    ABSOLUTE,
+    RELATIVE,
+    postprocessor_to_ours,
+    preprocessor_to_ours,
+    to_lerobot,
+)
+from lerobot_policy_pi05_geometry.data.relative_actions import ACTION_ANCHOR
 from tests.entry_points import ACTION_DIM, CHUNK, FRONT_DEPTH, STATE, STATE_DIM, TOKEN_MASK, TOKENS, make_observation
 
 from .sources import lerobot_pipelines, lerobot_policy, write_lerobot
@@ -59,15 +68,16 @@ def test_settings_of_steps_carry_over(tmp_path):
     assert by_type["NormalizerProcessorStep"].eps == 0.25
     assert by_type["PortableTokenizerProcessorStep"].max_length == 33
     assert by_type["DeviceProcessorStep"].device == "cpu"
-    assert [step["registry_name"] for step in pipeline["steps"]][:4] == [
-        step._registry_name for step in found.steps[:4]
-    ]
+    theirs = [step["registry_name"] for step in pipeline["steps"]]
+    kept = [name for step in found.steps if (name := getattr(type(step), "_registry_name", "")) in theirs]
+    assert kept == [name for name in theirs if "pi05" not in name and name not in ("tokenizer_processor", RELATIVE)]
 
 
 def test_the_tokenizer_travels_in_the_checkpoint(converted):
     """Nothing is looked up by name any more."""
     path = converted / "policy_preprocessor.json"
-    step = next(s for s in json.loads(path.read_text())["steps"] if s["registry_name"] == "pi05_geometry_tokenizer")
+    steps = json.loads(path.read_text())["steps"]
+    step = next(s for s in steps if s.get("registry_name") == "pi05_geometry_tokenizer")
     assert set(load_file(converted / step["state_file"])) == {"tokenizer.json", "tokenizer_config.json"}
 
 
@@ -81,7 +91,8 @@ def test_a_new_tokenizer_is_taken(lerobot_source, tmp_path):
     folder = lerobot_source / "tokenizer_of_the_test"
     convert(lerobot_source, tmp_path / "output", GeometryStart(source="none"), tokenizer=str(folder))
     text = (tmp_path / "output" / "policy_preprocessor.json").read_text()
-    assert json.loads(text)["steps"][5]["config"]["tokenizer_name"] == str(folder)
+    (step,) = (s for s in json.loads(text)["steps"] if s.get("registry_name") == "pi05_geometry_tokenizer")
+    assert step["config"]["tokenizer_name"] == str(folder)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -98,3 +109,65 @@ def test_exported_processors_are_lerobots(seed, converted, tmp_path):
         assert torch.equal(ours[key], theirs[key]), key
     action = torch.randn(2, ACTION_DIM)
     assert torch.equal(found[1](action), expected[1](action))
+
+
+def without_relative_actions(folder):
+    """A checkpoint whose processors were saved before LeRobot had relative actions."""
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        pipeline = json.loads((folder / name).read_text())
+        pipeline["steps"] = [step for step in pipeline["steps"] if step["registry_name"] not in (RELATIVE, ABSOLUTE)]
+        (folder / name).write_text(json.dumps(pipeline))
+    return folder
+
+
+@pytest.mark.parametrize("early", [False, True], ids=["with the steps", "saved before they existed"])
+@pytest.mark.parametrize("excluded", [[], ["grip"]])
+def test_relative_actions_can_be_switched_on_in_a_converted_checkpoint(early, excluded, tmp_path):
+    """lerobot-train does it by overrides of the saved steps; without them that was a KeyError."""
+    source = write_lerobot(tmp_path / "source")
+    convert(without_relative_actions(source) if early else source, tmp_path / "output", GeometryStart(source="none"))
+    names = ["x", "y", "z", "turn", "grip"]
+    settings = {"enabled": True, "exclude_joints": excluded, "action_names": names}
+    preprocess, _ = load(
+        tmp_path / "output",
+        preprocessor_overrides={RELATIVE: settings},
+        postprocessor_overrides={ABSOLUTE: {"enabled": True}},
+    )
+    theirs = lerobot_pipelines(lerobot_policy(), tmp_path / "tokenizer")[0]
+    (step,) = (step for step in theirs.steps if isinstance(step, RelativeActionsProcessorStep))
+    step.enabled, step.exclude_joints, step.action_names = True, excluded, names
+    batch = observation(2, 5)
+    found, expected = preprocess(dict(batch)), theirs(dict(batch))
+    for key in (STATE, "action"):
+        assert torch.equal(found[key], expected[key])
+    assert found[ACTION_ANCHOR].shape == (2, ACTION_DIM)
+
+
+def test_relative_actions_of_the_source_stay_relative_both_ways(tmp_path):
+    source = write_lerobot(tmp_path / "source", use_relative_actions=True, relative_exclude_joints=["grip"])
+    for name, key in (("policy_preprocessor.json", RELATIVE), ("policy_postprocessor.json", ABSOLUTE)):
+        pipeline = json.loads((source / name).read_text())
+        (step,) = (step for step in pipeline["steps"] if step["registry_name"] == key)
+        step["config"]["enabled"] = True
+        (source / name).write_text(json.dumps(pipeline))
+    convert(source, tmp_path / "output", GeometryStart(source="none"))
+    config = PI05GeometryConfig(device="cpu", use_relative_actions=True)
+    assert ACTION_ANCHOR in load(tmp_path / "output", config)[0](observation(2, 1))
+    export(tmp_path / "output", tmp_path / "back")
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        before, after = (json.loads((folder / name).read_text())["steps"] for folder in (source, tmp_path / "back"))
+        assert [step["registry_name"] for step in after] == [step["registry_name"] for step in before]
+        for theirs, ours in zip(before, after, strict=True):
+            if theirs["registry_name"] in (RELATIVE, ABSOLUTE):
+                assert ours == theirs
+
+
+def test_a_checkpoint_of_an_earlier_version_gets_the_steps(converted):
+    """Its relative actions were LeRobot's steps, and it had none around the normaliser; what is there already stays."""
+    for name, to_ours in (
+        ("policy_preprocessor.json", preprocessor_to_ours),
+        ("policy_postprocessor.json", postprocessor_to_ours),
+    ):
+        steps = json.loads((converted / name).read_text())["steps"]
+        assert to_ours(steps) == steps
+        assert to_ours(to_lerobot(steps)) == steps

@@ -5,7 +5,7 @@ import torch
 
 from lerobot_policy_pi05_geometry.checkpoint.conversion import GeometryStart, convert
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
-from tests.entry_points import FRONT_DEPTH, STATE, WRIST, WRIST_DEPTH, chunk_of, make_batch, make_calibration
+from tests.entry_points import CHUNK, FRONT_DEPTH, STATE, WRIST, WRIST_DEPTH, chunk_of, make_batch, make_calibration
 
 from .sources import DATASET_FEATURES, lerobot_chunk, lerobot_policy, load_on, write_openpi
 
@@ -133,3 +133,22 @@ def test_a_converted_checkpoint_keeps_its_features_or_takes_the_datas(lerobot_so
         convert(lerobot_source, tmp_path / name, features_from_data=from_data)
         policy = PI05GeometryPolicy.from_pretrained(tmp_path / name)
         assert (WRIST in policy.config.input_features) is not from_data
+
+
+@pytest.mark.parametrize("reduction", ["mean", "none"])
+def test_the_loss_is_the_sources_with_padding_too(reduction, lerobot_source, tmp_path, monkeypatch):
+    """LeRobot's π0.5 supervises the steps after an episode's end, and so does what was converted from it."""
+    convert(lerobot_source, tmp_path / "output", GeometryStart(source="none"))
+    ours = PI05GeometryPolicy.from_pretrained(tmp_path / "output").train()
+    theirs = lerobot_policy()
+    batch = make_batch(3)
+    batch["action_is_pad"] = torch.arange(CHUNK) >= torch.tensor([[CHUNK], [2], [1]])
+    draw = ours._draw(batch, torch.Size((3, CHUNK, 8)))
+    monkeypatch.setattr(theirs.model, "sample_noise", lambda *_: draw.noise)
+    monkeypatch.setattr(theirs.model, "sample_time", lambda *_: draw.time)
+    expected, told = theirs.forward(batch, reduction=reduction)
+    found, info = ours.forward(batch, reduction=reduction)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
+    assert info["loss"] == pytest.approx(told["loss"], abs=1e-5)
+    ours.config.padded_actions = "masked"
+    assert not torch.allclose(ours.forward(batch, reduction=reduction)[0], expected, atol=1e-3)

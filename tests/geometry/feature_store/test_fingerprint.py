@@ -27,7 +27,7 @@ def test_episodes_are_told_apart_by_their_length_and_statistics(original, root, 
     assert before.frames == [4, 3]
     assert len(set(before.hashes)) == 2
     assert read_episodes(root) == before
-    write_frame_quantiles(root, REPO_ID)
+    write_frame_quantiles(root, REPO_ID, ("observation.state", "action"))
     (root / "meta" / "info.json").write_text((root / "meta" / "info.json").read_text() + " ")
     modify_tasks(LeRobotDataset(REPO_ID, root=root), new_task="pull")
     assert read_episodes(root) == before, "features depend on none of these"

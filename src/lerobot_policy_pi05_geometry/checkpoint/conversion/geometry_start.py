@@ -68,6 +68,7 @@ class GeometryStart:
             "geometry_tokens": self.tokens or "statistics",
             "geometry_gate_openness": SHUT if self.openness is None else self.openness,
             "geometry_positions": "parallel",
+            "padded_actions": "supervised",  # as it was trained
             "da3_encoder": (self.encoder or DEFAULT_ENCODER) if from_rgb else None,
             **TAKE_UP,
         }

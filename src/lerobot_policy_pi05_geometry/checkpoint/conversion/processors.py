@@ -16,9 +16,10 @@ from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PR
 from safetensors.torch import load_file, save_file
 
 from ...configuration_pi05_geometry import PI05GeometryConfig
-from ...data.prompt import PALIGEMMA_TOKENIZER, PortableTokenizerProcessorStep, check_vocabulary
+from ...data.tokenizer import PALIGEMMA_TOKENIZER, PortableTokenizerProcessorStep, check_vocabulary
 from ...model.variants import PALIGEMMA_VARIANTS
 from ...processor_pi05_geometry import make_pi05_geometry_pre_post_processors
+from .steps import Step, postprocessor_to_ours, preprocessor_to_ours, step_name, to_lerobot
 
 PREPROCESSOR, POSTPROCESSOR = f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json"
 TOKENIZER_FOLDER = (
@@ -29,14 +30,13 @@ _THEIR_PROMPT, _THEIR_TOKENIZER = "pi05_prepare_state_tokenizer_processor_step",
 _OUR_PROMPT, _OUR_TOKENIZER = "pi05_geometry_prompt", "pi05_geometry_tokenizer"
 
 FindFile = Callable[[str], Path]
-Step = dict[str, Any]
 
 
 def read_pipeline(path: Path) -> dict[str, Any]:
     """A saved pipeline. Raises ValueError if it is none."""
     try:
         pipeline = json.loads(path.read_text())
-        [step["registry_name"] for step in pipeline["steps"]]
+        [step_name(step) for step in pipeline["steps"]]
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{path} is no processor pipeline: expected a JSON object with named 'steps'.") from error
     return pipeline
@@ -66,8 +66,8 @@ def processors_from_lerobot(find: FindFile, config: PI05GeometryConfig, tokenize
         task_key = step.get("config", {}).get("task_key", "task")
         return {"registry_name": _OUR_PROMPT, "config": {"task_key": task_key}}
 
-    _rewrite(find, PREPROCESSOR, {_THEIR_PROMPT: prompt, _THEIR_TOKENIZER: tokenize}, output)
-    _rewrite(find, POSTPROCESSOR, {}, output)
+    _rewrite(find, PREPROCESSOR, {_THEIR_PROMPT: prompt, _THEIR_TOKENIZER: tokenize}, preprocessor_to_ours, output)
+    _rewrite(find, POSTPROCESSOR, {}, postprocessor_to_ours, output)
 
 
 def processors_to_lerobot(find: FindFile, output: Path) -> None:
@@ -88,14 +88,14 @@ def processors_to_lerobot(find: FindFile, output: Path) -> None:
     def prompt(step: Step) -> Step:
         return {"registry_name": _THEIR_PROMPT, "config": step.get("config", {})}
 
-    _rewrite(find, PREPROCESSOR, {_OUR_PROMPT: prompt, _OUR_TOKENIZER: tokenize}, output)
-    _rewrite(find, POSTPROCESSOR, {}, output)
+    _rewrite(find, PREPROCESSOR, {_OUR_PROMPT: prompt, _OUR_TOKENIZER: tokenize}, to_lerobot, output)
+    _rewrite(find, POSTPROCESSOR, {}, to_lerobot, output)
 
 
 def copy_processors(find: FindFile, output: Path) -> None:
-    """Write the processors of a checkpoint of this policy as they are."""
-    _rewrite(find, PREPROCESSOR, {}, output)
-    _rewrite(find, POSTPROCESSOR, {}, output)
+    """Write the processors of a checkpoint of this policy, with steps that an earlier version did not have."""
+    _rewrite(find, PREPROCESSOR, {}, preprocessor_to_ours, output)
+    _rewrite(find, POSTPROCESSOR, {}, postprocessor_to_ours, output)
 
 
 def new_processors(config: PI05GeometryConfig, tokenizer: str | None, output: Path) -> None:
@@ -104,23 +104,32 @@ def new_processors(config: PI05GeometryConfig, tokenizer: str | None, output: Pa
         pipeline.save_pretrained(output)
 
 
-def _rewrite(find: FindFile, name: str, replaced: dict[str, Callable[[Step], Step]], output: Path) -> None:
-    """Copy a pipeline with its state files; `replaced` says by registry name which steps become others."""
+def _rewrite(
+    find: FindFile,
+    name: str,
+    replaced: dict[str, Callable[[Step], Step]],
+    rearrange: Callable[[list[Step]], list[Step]],
+    output: Path,
+) -> None:
+    """Copy a pipeline with its state files.
+
+    replaced: by the name of a step, what it becomes. rearrange: takes and returns all steps, after that.
+    """
     path = find(name)
     pipeline = read_pipeline(path)
-    names = [step["registry_name"] for step in pipeline["steps"]]
+    names = [step_name(step) for step in pipeline["steps"]]
     for expected in replaced:
         if names.count(expected) != 1:
             raise ValueError(f"{path} needs exactly one step '{expected}', but its steps are {', '.join(names)}.")
     steps = []
     for step in pipeline["steps"]:
-        change = replaced.get(step["registry_name"])
+        change = replaced.get(step_name(step))
         if change is not None:
             steps.append(change(step))
             continue
-        if step["registry_name"] == "device_processor":  # whoever loads the checkpoint says where it runs
+        if step_name(step) == "device_processor":  # whoever loads the checkpoint says where it runs
             step = {**step, "config": {**step.get("config", {}), "device": "cpu"}}
         if "state_file" in step:
             shutil.copyfile(find(step["state_file"]), output / step["state_file"])
         steps.append(step)
-    (output / name).write_text(json.dumps({**pipeline, "steps": steps}, indent=2))
+    (output / name).write_text(json.dumps({**pipeline, "steps": rearrange(steps)}, indent=2))
