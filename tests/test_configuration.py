@@ -282,7 +282,7 @@ def test_bad_numbers_are_refused_in_one_sentence(changes, said):
 def test_options_of_experiments_stand_apart_and_keep_their_names(tmp_path):
     """They are declared in another class than a user's settings, under the flags and the JSON names that they always had."""
     apart = {field.name for field in dataclasses.fields(AblationSettings)}
-    assert apart == {"geometry_time", "geometry_placement", "geometry_expert"}
+    assert {"geometry_time", "geometry_placement", "geometry_expert"} <= apart
     assert not apart & set(PI05GeometryConfig.__annotations__)
     make_config().save_pretrained(tmp_path)
     saved = json.loads((tmp_path / "config.json").read_text())
