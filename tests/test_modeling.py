@@ -517,7 +517,7 @@ def test_depth_cameras_need_extrinsics_in_the_base_frame():
 def test_depth_cameras_need_intrinsics():
     calibration = make_calibration()
     del calibration["wrist"]
-    with pytest.raises(ValueError, match=r"Depth camera 'wrist' has no intrinsics \(the calibration has front\)"):
+    with pytest.raises(ValueError, match=r"Camera 'wrist' has no intrinsics \(the calibration has front\)"):
         make_policy(calibration=calibration)
     assert make_policy(calibration=calibration, geometry_cameras=["front"]).geometry.source.cameras == ("front",)
     calibration["wrist"] = copy.deepcopy(calibration["front"])

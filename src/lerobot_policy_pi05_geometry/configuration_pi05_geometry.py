@@ -47,7 +47,7 @@ EMPTY_CAMERA = f"{IMAGE_PREFIX}empty_camera_"
 DEFAULT_ENCODER = "depth-anything/DA3-BASE"
 
 SOURCES = ("none", "rgbd", "da3", "features")
-CONTROLS = ("random",)  # sources for comparison only, see model/ablations.py
+CONTROLS = ("random", "rays")  # sources for comparison only, see model/ablations.py
 _NEVER_READ = (FeatureType.STATE, FeatureType.ENV)  # types of which the policy reads observation.state alone
 
 _CHOICES = {

@@ -5,9 +5,18 @@ import json
 
 import pytest
 
+from lerobot_policy_pi05_geometry.sim.cameras import find_range
 from lerobot_policy_pi05_geometry.study.arms import ARMS
-from lerobot_policy_pi05_geometry.study.conditions import CONDITIONS, equivalent_condition
-from lerobot_policy_pi05_geometry.study.simulated import from_json, runs_of
+from lerobot_policy_pi05_geometry.study.conditions import (
+    CONDITIONS,
+    azimuth_condition,
+    azimuth_of,
+    equivalent_condition,
+    find_condition,
+)
+from lerobot_policy_pi05_geometry.study.plan import runs_of
+from lerobot_policy_pi05_geometry.study.pretraining import read_pretraining
+from lerobot_policy_pi05_geometry.study.simulated import from_json
 from lerobot_policy_pi05_geometry.study.spec import STUDIES, Budget, read_spec
 
 pytestmark = pytest.mark.sim
@@ -47,7 +56,7 @@ def test_the_default_study_is_the_one_that_was_promised(tmp_path):
     assert spec.budget.evaluation_episodes >= 50
     conditions = {(run.task, run.arm_name): set(run.conditions) for run in runs_of(spec, tmp_path)}
     arms = {task: {arm for t, arm in conditions if t == task} for task, _ in conditions}
-    assert max(arms.values(), key=len) == set(ARMS)
+    assert max(arms.values(), key=len) == set(ARMS) - {"rgb+rays", "rgb+modulation"}  # of the study warm-start
     assert len(arms) >= 3
     for task, on_task in arms.items():
         assert {"blind", "rgb", "rgb-wide", "geometry"} <= on_task
@@ -104,8 +113,77 @@ def test_a_run_is_kept_by_what_it_depends_on(tmp_path):
     assert (other_data.folder == run.folder, other_data.data_folder == run.data_folder) == (False, False)
 
 
-def test_conditions_of_the_depth_sensor_are_not_evaluated_for_arms_without_depth():
+def test_a_fault_is_evaluated_only_for_arms_that_read_what_it_changes():
     for name, condition in CONDITIONS.items():
-        assert equivalent_condition(name, depth=True) == name
-        shown = CONDITIONS[equivalent_condition(name, depth=False)]
-        assert (shown.cameras, shown.sensor) == (condition.cameras, "ideal")
+        for arm in ARMS.values():
+            evaluated = CONDITIONS[equivalent_condition(name, arm)]
+            assert evaluated.cameras == condition.cameras
+            assert evaluated.sensor == (condition.sensor if condition.changes in arm.reads else "ideal")
+    rays = ARMS["rgb+rays"]  # they know the camera's pose, and measure no depth
+    assert equivalent_condition("calibration-5", rays) == "calibration-5"
+    assert equivalent_condition("depth-off", rays) == "inside"
+
+
+def test_an_azimuth_is_a_condition():
+    condition = find_condition(azimuth_condition(-30))
+    assert (condition.cameras, condition.sensor) == ("azimuth-30", "ideal")
+    assert azimuth_of(azimuth_condition(-30)) == -30
+    assert azimuth_of(azimuth_condition(7.5)) == 7.5
+    assert azimuth_of("outside") is None
+    assert find_range(condition.cameras).azimuth == ((-30.0, -30.0),)
+    for wrong in ("azimuth", "azimuth+north", "azimuthnan", "azimuth+inf"):
+        with pytest.raises(ValueError, match="no camera range"):
+            find_range(wrong)
+
+
+GROWING = (
+    SPEC.replace('"noise"]', '"outside"]')
+    + """
+[pretrain]
+tasks = ["faucet-open-wide"]
+[growth]
+multiples = [1, 3]
+[sweep]
+azimuths = [-30, 30]
+arms = ["rgb"]
+"""
+)
+
+
+def test_a_warm_start_is_read_and_reaches_the_worker(tmp_path):
+    spec = read_spec(write(tmp_path, GROWING))
+    assert (spec.growth.multiples, spec.sweep.azimuths) == ((1, 3), (-30, 30))
+    run = runs_of(spec, tmp_path, 3)[1]
+    assert (run.steps, run.pretraining.tasks) == (21, ("faucet-open-wide",))
+    assert from_json(json.loads(run.to_json())) == run
+    assert read_pretraining(json.loads(run.origin.to_json())["pretraining"]) == spec.pretraining
+    once = runs_of(spec, tmp_path)[1]
+    scratch = runs_of(read_spec(write(tmp_path, SPEC)), tmp_path)[1]
+    assert len({run.folder, once.folder, scratch.folder}) == 3
+    assert run.start == once.start  # however long it is trained
+    other = dataclasses.replace(run, pretraining=dataclasses.replace(run.pretraining, steps=5))
+    assert (other.folder == run.folder, other.start == run.start) == (False, False)
+    more = dataclasses.replace(run.pretraining, evaluated=run.pretraining.tasks)
+    assert dataclasses.replace(run, pretraining=more).folder == run.folder  # only evaluated in addition
+    arguments = run.arguments(tmp_path / "output")
+    assert f"--policy.path={run.start}" in arguments
+    assert not [a for a in arguments if a.startswith(("--policy.type", "--policy.geometry_source"))]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("[1, 3]", "[3, 1]"), "rise from 1 on"),
+        (("[1, 3]", "[0, 3]"), "rise from 1 on"),
+        (("faucet-open-wide", "faucet"), "no simulated task"),
+        (('tasks = ["faucet-open-wide"]\n', ""), "incomplete"),
+        (('arms = ["rgb"]\n', 'arms = ["grid-4"]\n'), "grid-4, which no"),
+        (('"outside"]', '"noise"]'), "decides by the conditions inside, outside"),
+        (('arms = ["rgb", "geometry"]', 'arms = ["rgb+modulation"]'), "adapts arm 'rgb'"),
+        (("[growth]", "[growth]\nfactor = 2"), "unknown entries factor"),
+        (('["faucet-open-wide"]', '["faucet-open-wide"]\nevaluated = ["reach-v3"]'), "on which it is not trained"),
+    ],
+)
+def test_a_warm_start_that_does_not_fit_is_refused(tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        read_spec(write(tmp_path, GROWING.replace(*change)))

@@ -13,7 +13,8 @@ import pandas as pd
 import pytest
 
 from lerobot_policy_pi05_geometry.study.launch import share
-from lerobot_policy_pi05_geometry.study.simulated import SimulatedRun, runs_of
+from lerobot_policy_pi05_geometry.study.plan import runs_of
+from lerobot_policy_pi05_geometry.study.simulated import SimulatedRun
 from lerobot_policy_pi05_geometry.study.spec import read_spec
 from lerobot_policy_pi05_geometry.study.training_log import read_curve, read_log_line
 
@@ -22,11 +23,9 @@ CLI = [sys.executable, "-m", "lerobot_policy_pi05_geometry.cli"]
 ENVIRONMENT = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
 
 
-def command(*arguments: str, code: int = 0, **environment: str) -> str:
+def command(*arguments: str, code: int = 0, timeout: float = 500) -> str:
     """Run `pi05-geometry` without a hub; returns what it printed."""
-    result = subprocess.run(
-        [*CLI, *arguments], env=ENVIRONMENT | environment, capture_output=True, text=True, timeout=500
-    )
+    result = subprocess.run([*CLI, *arguments], env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout)
     assert result.returncode == code, result.stdout[-2000:] + result.stderr[-3000:]
     return result.stdout
 
@@ -89,6 +88,24 @@ def test_the_report_holds_every_figure(study):
     assert len(table) == 3 * 2 * 2 * 2 + 2 * 2
     assert page.count("<td>–</td>") == 2 + 2
     assert table.groupby(["arm", "training_seed", "condition"])["episode_seed"].apply(list).map(str).nunique() == 1
+
+
+@pytest.mark.long
+def test_the_warm_start_study_end_to_end(tmp_path):
+    """Every phase as a user starts it: the estimate, the pretraining, two multiples of the steps, the sweep, the report."""
+    folder = tmp_path / "warm"
+    printed = command("study", "--spec", "warm-start", "--smoke", "--output", str(folder), timeout=3000)
+    assert "core-hours" in printed
+    assert "azimuth sweep" in printed
+    table = pd.read_csv(folder / "episodes.csv")
+    assert not table["crashed"].any()
+    assert set(table["multiple"]) == {1, 2}
+    assert set(table["arm"]) == {"blind", "rgb", "geometry", "rgb-wide", "rgb+rays", "rgb+modulation"}
+    swept = table[table["condition"].str.startswith("azimuth")]
+    assert set(swept["arm"]) == {"rgb", "geometry", "rgb+modulation"}
+    assert (folder / "report.html").read_text().count("<img ") == 3
+    printed = command("study", "--spec", "warm-start", "--smoke", "--estimate", "--output", str(folder))
+    assert "0.0 core-hours if every arm" in printed
 
 
 def test_a_study_killed_at_any_point_gives_the_same_table(short, short_table, tmp_path):

@@ -36,10 +36,13 @@ def demo(
 def study(
     context: typer.Context,
     spec: Annotated[
-        str, typer.Option(help="A study's TOML file, or the name of one: default, longer, demo, smoke.")
+        str, typer.Option(help="A study's TOML file, or the name of one: warm-start, default, longer, demo, smoke.")
     ] = "default",
     output: Output = Path("study"),
     workers: Workers = None,
+    estimate: Annotated[
+        bool, typer.Option("--estimate", help="Only estimate the core-hours that are left, from a short measurement.")
+    ] = False,
     smoke: Annotated[bool, typer.Option("--smoke", help="Every step at the smallest size, as a test.")] = False,
     retry_crashed: Annotated[bool, typer.Option("--retry-crashed", help="Try crashed runs again.")] = False,
     dataset_root: Annotated[
@@ -66,12 +69,17 @@ def study(
             raise ValueError(
                 f"{context.args[0]} is not an option of a simulated study; put the budget into a --spec file."
             )
-        name = "smoke" if smoke else spec
+        name = {"warm-start": "warm-start-smoke"}.get(spec, "smoke") if smoke else spec
+        if estimate:
+            require_simulator()
+            _print_estimate(name, output)
+            return
         command = f"pi05-geometry study --spec {name} --output {output}"
         path = _simulated_study(name, output, workers, retry_crashed, command)
     else:
         from ..study.held_out import held_out_runs
         from ..study.held_out_report import write_held_out_report
+        from ..study.launch import rank, wait_for
 
         options = _forwarded(context.args)
         numbers = [int(seed) for seed in seeds.split(",")]
@@ -81,8 +89,10 @@ def study(
         if workers is None and options.get("policy.device", "cpu") != "cpu":
             workers = 1  # one run at a time on an accelerator
         _execute(runs, workers, retry_crashed)
+        wait_for(runs)
+        _print_crashed(runs)
         command = " ".join(["pi05-geometry study", f"--dataset.root={dataset_root}", *context.args])
-        path = write_held_out_report(output, runs, command) if _complete(runs) else None
+        path = write_held_out_report(output, runs, command) if rank() == 0 else None
     if path is not None:
         console.print(f"Open [bold]{path}[/bold]")
 
@@ -99,15 +109,47 @@ def _forwarded(arguments: list[str]) -> dict[str, str]:
 
 
 def _simulated_study(name: str, output: Path, workers: int | None, retry_crashed: bool, command: str) -> Path | None:
-    """Execute this rank's share of a simulated study; write the report if all runs are complete."""
+    """Execute this rank's share of a simulated study, phase by phase; rank 0 writes the report."""
     require_simulator()
+    from ..study.growth_report import write_growth_report
+    from ..study.launch import rank, wait_for
+    from ..study.plan import phases
+    from ..study.pretraining import PretrainingRun
     from ..study.report import write_report
-    from ..study.simulated import runs_of
+    from ..study.simulated import SimulatedRun
     from ..study.spec import read_spec
 
-    runs = runs_of(read_spec(name), output)
-    _execute(runs, workers, retry_crashed)
-    return write_report(output, runs, command) if _complete(runs) else None
+    spec = read_spec(name)
+    grows = len(spec.growth.multiples) > 1
+    if grows and rank() == 0:
+        _print_estimate(name, output)
+    runs: list[PretrainingRun | SimulatedRun] = []
+    for phase in phases(spec, output):
+        console.print(f"{phase.title} ({len(phase.runs)} runs)", soft_wrap=True)
+        _execute(phase.runs, workers, retry_crashed)
+        wait_for(phase.runs)
+        runs += phase.runs
+    _print_crashed(runs)
+    if rank() > 0:
+        return None
+    if grows:
+        return write_growth_report(output, spec, runs, command)
+    return write_report(output, [run for run in runs if isinstance(run, SimulatedRun)], command)
+
+
+def _print_estimate(name: str, output: Path) -> None:
+    from ..study.estimate import estimate, measure_costs
+    from ..study.spec import read_spec
+
+    spec = read_spec(name)
+    costs = measure_costs(spec.budget, spec.comparisons[0].tasks[0])
+    hours = estimate(spec, output, costs)
+    console.print(
+        f"Estimate of what is left: {hours.least:.1f} core-hours if every arm stops improving as early as the rule allows, "
+        f"{hours.most:.1f} if none does ({1000 * costs.step:.0f} ms for a training step, {costs.episode:.1f} s for an "
+        "evaluation episode, in one thread).",
+        soft_wrap=True,
+    )
 
 
 def _execute(runs: "Sequence[Run]", workers: int | None, retry_crashed: bool) -> None:
@@ -117,15 +159,9 @@ def _execute(runs: "Sequence[Run]", workers: int | None, retry_crashed: bool) ->
         launch(share(runs), workers or default_workers(), _study_progress(bars), retry_crashed)
 
 
-def _complete(runs: "Sequence[Run]") -> bool:
-    """Whether all runs are complete or crashed; prints the crashed ones."""
-    crashed = [run for run in runs if run.crash.exists()]
-    for run in crashed:
+def _print_crashed(runs: "Sequence[Run]") -> None:
+    for run in {run.folder: run for run in runs if run.crash.exists()}.values():
         console.print(f"[bold red]Crashed[/bold red] {run.name}: see {escape(str(run.log))}", soft_wrap=True)
-    if any(run.missing() for run in runs if run not in crashed):
-        console.print("The runs of this rank are complete; the rank that finishes last writes the report.")
-        return False
-    return True
 
 
 def _study_progress(bars: Progress) -> "Callable[[StudyProgress], None]":

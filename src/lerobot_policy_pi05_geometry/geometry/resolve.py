@@ -17,12 +17,17 @@ from .feature_store import FeatureStoreSource
 from .feature_store.match import open_store
 from .keys import camera_of, extrinsics_key
 from .random_tokens import RandomSource
+from .rays import FEATURE_DIM as RAY_FEATURES
+from .rays import RaySource
 from .rgbd import RgbdSource, depth_features
 from .source import GeometrySource
 from .unknown_cameras import UnknownCameras
 
 if TYPE_CHECKING:
     from ..configuration_pi05_geometry import PI05GeometryConfig
+
+
+FROM_RGB = ("da3", "features", "rays")  # sources with one view per RGB camera
 
 
 class Resolved(NamedTuple):
@@ -45,6 +50,8 @@ def resolve(
         return Resolved(None, {})
     if config.geometry_source in ("da3", "features"):
         return _resolve_from_rgb(config, dataset_meta, encoder)
+    if config.geometry_source == "rays":
+        return _resolve_rays(config, dataset_meta)
     return _resolve_depth(config, dataset_meta)
 
 
@@ -92,11 +99,8 @@ def _resolve_depth(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Re
             "--policy.depth_keys, or train with --policy.geometry_source=none (for a converted checkpoint: convert it with "
             "--geometry-source none)."
         )
-    calibration = resolve_calibration(config, dataset_meta)
-    check_calibration(config, calibration, list(sizes))
-    changes["calibration"] = calibration
-    changes["calibration_given"] = config.calibration_given or config.calibration_path is not None
-    changes["calibration_path"] = None  # the checkpoint now carries the content
+    changes |= _calibrated(config, dataset_meta, list(sizes))
+    calibration = changes["calibration"]
     source = RgbdSource(
         tuple(sizes),
         config.geometry_grid,
@@ -111,11 +115,42 @@ def _resolve_depth(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Re
     return Resolved(source, changes)
 
 
+def _resolve_rays(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Resolved:
+    """Rays of the RGB cameras, which need calibration as depth cameras do."""
+    keys = config.rgb_cameras()
+    changes: dict[str, Any] = {}
+    if config.geometry_pending and keys:
+        _check_camera_count(config, list(keys))
+        changes["geometry_pending"] = 0
+    elif config.geometry_pending and dataset_meta is None:
+        return Resolved(UnknownCameras(_pending(config), config.geometry_grid, RAY_FEATURES), {})
+    if not keys:
+        raise ValueError("geometry_source=rays needs RGB cameras, but the data has none; use geometry_source=none.")
+    if config.geometry_frame != "base":
+        raise ValueError(
+            "geometry_source=rays describes where the camera stands in the robot's base frame; leave geometry_frame=base."
+        )
+    changes |= _calibrated(config, dataset_meta, list(keys))
+    sizes = {camera: config.image_features[key].shape[-2:] for camera, key in keys.items()}
+    return Resolved(RaySource(tuple(keys), config.geometry_grid, changes["calibration"], sizes), changes)
+
+
+def _calibrated(config: "PI05GeometryConfig", dataset_meta: Any | None, cameras: list[str]) -> dict[str, Any]:
+    """Fields that record the calibration of these cameras, which is checked."""
+    calibration = resolve_calibration(config, dataset_meta)
+    check_calibration(config, calibration, cameras)
+    return {
+        "calibration": calibration,
+        "calibration_given": config.calibration_given or config.calibration_path is not None,
+        "calibration_path": None,  # the checkpoint now carries the content
+    }
+
+
 def camera_names(config: "PI05GeometryConfig") -> tuple[str, ...]:
     """The geometry cameras in token order, as far as the configuration knows them; names in their place while data is awaited."""
     if config.geometry_source == "none":
         return ()
-    if config.geometry_source in ("da3", "features"):
+    if config.geometry_source in FROM_RGB:
         return tuple(config.rgb_cameras()) or _pending(config)
     images = tuple(camera_of(key) for key in config.image_features) if config.geometry_source == "random" else ()
     return tuple(config.depth_cameras()) or _pending(config) or images
@@ -130,7 +165,7 @@ def _check_camera_count(config: "PI05GeometryConfig", cameras: list[str]) -> Non
     """Raise ValueError unless the data has as many cameras as a converted checkpoint was made for."""
     if len(cameras) != config.geometry_pending:
         names = ",".join(cameras)
-        kind = "RGB images" if config.geometry_source in ("da3", "features") else "depth"
+        kind = "RGB images" if config.geometry_source in FROM_RGB else "depth"
         raise ValueError(
             f"The checkpoint was converted for geometry from {config.geometry_pending} camera(s), but the data has {kind} "
             f"from {len(cameras)}: {names}; convert again with --geometry-cameras {names}, or choose among them with "
@@ -194,18 +229,18 @@ def resolve_calibration(config: "PI05GeometryConfig", dataset_meta: Any | None) 
 def check_calibration(
     config: "PI05GeometryConfig", calibration: dict[str, CameraCalibration], cameras: list[str]
 ) -> None:
-    """Raise ValueError unless every depth camera has usable intrinsics, and a pose where one is needed."""
+    """Raise ValueError unless every camera has usable intrinsics, and a pose where one is needed."""
     for camera in cameras:
         if camera not in calibration:
             known = ", ".join(sorted(calibration)) or "no camera"
             raise ValueError(
-                f"Depth camera '{camera}' has no intrinsics (the calibration has {known}); give a calibration file with "
+                f"Camera '{camera}' has no intrinsics (the calibration has {known}); give a calibration file with "
                 "--policy.calibration_path, or store it in the dataset with pi05-geometry store-calibration."
             )
         calibration[camera].check(camera)
         posed = calibration[camera].extrinsics is not None or extrinsics_key(camera) in config.geometry_features
         if config.geometry_frame == "base" and not posed:
             raise ValueError(
-                f"Depth camera '{camera}' has no extrinsics: neither in its calibration nor as {extrinsics_key(camera)} in "
+                f"Camera '{camera}' has no extrinsics: neither in its calibration nor as {extrinsics_key(camera)} in "
                 "the data; give them, or set --policy.geometry_frame=camera."
             )

@@ -1,7 +1,6 @@
 """Figures. Each function returns a matplotlib figure of measured values."""
 
-import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import matplotlib
 import numpy as np
@@ -18,9 +17,6 @@ from ..geometry.keys import find_depth_key
 from ..modeling_pi05_geometry import PI05GeometryPolicy
 from .attention import attention_layout, suffix_attention
 
-INK = "#22303c"
-COLOURS = {"geometry": "#0b7285", "rgb": "#e8590c", "rgb-wide": "#f59f00", "random": "#ae3ec9", "blind": "#868e96"}
-OTHER = "#74b8c4"  # variants of geometry
 SEGMENT_COLOURS = ("#4263eb", "#0b7285", "#e8590c")
 SEGMENT_NAMES = ("prefix", "geometry", "suffix")
 
@@ -107,71 +103,6 @@ def segment_share_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]
     axes.set_ylabel("share of the action tokens' attention")
     axes.set_ylim(0, 1)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=3, frameon=False)
-    return figure
-
-
-def success_figure(
-    conditions: Sequence[str], arms: Mapping[str, Sequence[tuple[float, float, float] | None]]
-) -> Figure:
-    """Success rates with intervals, one panel per condition.
-
-    arms: per arm one (rate, low, high) per condition, None where it was not evaluated.
-    """
-    columns = min(len(conditions), 4)
-    rows = -(-len(conditions) // columns)
-    size = (1.6 + 2.9 * columns, rows * (0.9 + 0.36 * len(arms)))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = list(figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False).flat)
-    y = np.arange(len(arms))[::-1]
-    for i, condition in enumerate(conditions):
-        axes = panels[i]
-        for yi, (arm, values) in zip(y, arms.items(), strict=True):
-            value = values[i]
-            if value is None:
-                axes.text(0.02, yi, "not evaluated", va="center", color=OTHER, fontsize=8)
-                continue
-            rate, low, high = value
-            axes.barh(yi, rate, 0.62, color=COLOURS.get(arm, OTHER))
-            axes.plot([low, high], [yi, yi], color=INK, linewidth=1.4)
-            axes.text(high + 0.02, yi, f"{rate:.0%}", va="center", color=INK, fontsize=9)
-        axes.set_title(textwrap.fill(condition, 30), fontsize=10)
-        axes.set_xlim(0, 1.15)
-        axes.set_xticks(np.linspace(0, 1, 3), [f"{v:.0%}" for v in np.linspace(0, 1, 3)])
-        axes.set_yticks(y, list(arms))
-        axes.spines[["top", "right"]].set_visible(False)
-    for axes in panels[len(conditions) :]:
-        axes.set_visible(False)
-    figure.supxlabel("episodes that succeed, with 95 % intervals", fontsize=10)
-    return figure
-
-
-def curves_figure(curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
-    """Training loss per arm. curves: per arm {"step": [...], "loss": [...]}."""
-    figure = Figure(figsize=(5.2, 3.4), layout="constrained")
-    axes = figure.subplots()
-    for arm, curve in curves.items():
-        axes.plot(curve["step"], curve["loss"], color=COLOURS.get(arm), label=arm)
-    axes.set_xlabel("training step")
-    axes.set_ylabel("flow-matching loss")
-    axes.set_yscale("log")
-    axes.legend(frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure
-
-
-def horizon_figure(arms: Mapping[str, np.ndarray]) -> Figure:
-    """Error by step ahead. arms: per arm (3, S), mean, low and high."""
-    figure = Figure(figsize=(6.2, 3.6), layout="constrained")
-    axes = figure.subplots()
-    for arm, (mean, low, high) in arms.items():
-        steps = np.arange(1, len(mean) + 1)
-        (line,) = axes.plot(steps, mean, color=COLOURS.get(arm), label=arm, marker="o", markersize=3)
-        axes.fill_between(steps, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
-    axes.set_xlabel("step ahead")
-    axes.set_ylabel("error (standard deviations)")
-    axes.set_ylim(bottom=0)
-    axes.legend(frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
     return figure
 
 

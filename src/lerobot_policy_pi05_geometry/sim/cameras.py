@@ -46,6 +46,30 @@ CAMERA_RANGES = {
     "wide": CameraRange(((-40.0, 40.0),)),
 }
 
+_AZIMUTH = "azimuth"
+
+
+def azimuth_range(degrees: float) -> str:
+    """Name of the range of camera poses at one azimuth, an offset from `BASE_AZIMUTH`: "azimuth+30"."""
+    return f"{_AZIMUTH}{degrees:+g}"
+
+
+def find_range(name: str) -> CameraRange:
+    """The range of this name: of `CAMERA_RANGES`, or `azimuth_range`'s, with elevation and distance as in training.
+
+    Raises ValueError that lists the known names.
+    """
+    if name in CAMERA_RANGES:
+        return CAMERA_RANGES[name]
+    try:
+        if name.startswith(_AZIMUTH) and math.isfinite(degrees := float(name.removeprefix(_AZIMUTH))):
+            return CameraRange(((degrees, degrees),))
+    except ValueError:
+        pass
+    raise ValueError(
+        f"There is no camera range '{name}'; choose one of: {', '.join(CAMERA_RANGES)}, or {_AZIMUTH}+30 for one azimuth."
+    )
+
 
 def intrinsics(model: mujoco.MjModel, size: int) -> CameraCalibration:
     """Intrinsics of MuJoCo's free camera for square images; its pose comes with every frame."""

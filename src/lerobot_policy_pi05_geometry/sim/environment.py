@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from .cameras import CAMERA_RANGES, extrinsics, intrinsics
+from .cameras import extrinsics, find_range, intrinsics
 from .headless import mujoco
 from .sensor import SENSORS
 from .tasks import find_task, make_simulator
@@ -45,13 +45,11 @@ class RgbdMetaworldEnv(gym.Env):
         episode_length: int | None = None,
         sensor: str = "ideal",
     ) -> None:
-        if cameras not in CAMERA_RANGES:
-            raise ValueError(f"There is no camera range '{cameras}'; choose one of: {', '.join(CAMERA_RANGES)}.")
         if sensor not in SENSORS:
             raise ValueError(f"There is no depth sensor '{sensor}'; choose one of: {', '.join(SENSORS)}.")
         spec = find_task(task)
         self.task, self.task_description = task, spec.instruction
-        self._spec, self._range, self.image_size = spec, CAMERA_RANGES[cameras], image_size
+        self._spec, self._range, self.image_size = spec, find_range(cameras), image_size
         self._sensor = SENSORS[sensor]
         self._max_episode_steps = episode_length or spec.max_steps
         size = image_size

@@ -38,6 +38,22 @@ WIDE_TASKS = {
         "press the button of the coffee machine",
         ((-0.20, 0.75, -0.001), (0.20, 0.95, 0.001)),
     ),
+    "button-press-wide": TaskSpec(
+        "button-press-v3",
+        "press the button from the front",
+        ((-0.30, 0.75, 0.115), (0.30, 0.95, 0.1151)),
+    ),
+    "handle-press-wide": TaskSpec(
+        "handle-press-v3",
+        "press the handle down",
+        ((-0.30, 0.65, -0.001), (0.30, 0.90, 0.001)),
+    ),
+    "drawer-open-wide": TaskSpec(
+        "drawer-open-v3",
+        "open the drawer",
+        ((-0.30, 0.70, 0.0), (0.30, 0.90, 0.0)),
+        max_steps=60,
+    ),
 }
 
 

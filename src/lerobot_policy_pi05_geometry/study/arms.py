@@ -1,4 +1,4 @@
-"""Arms of a study: what a policy observes, and where its geometry enters. Everything else is equal.
+"""Arms of a study: what a policy observes, and where geometry enters. Everything else is equal.
 
 An arm is a set of `--policy.*` options of lerobot-train, added to the budget's. So anyone can train it without a study.
 """
@@ -6,6 +6,7 @@ An arm is a set of `--policy.*` options of lerobot-train, added to the budget's.
 from dataclasses import dataclass, field
 
 BLIND_INPUTS = '{"observation.state": {"type": "STATE", "shape": [4]}}'
+DEPTH, POSE = "depth", "pose"  # what an arm may read besides RGB, and what a faulty sensor may change
 
 
 @dataclass(frozen=True)
@@ -13,37 +14,41 @@ class Arm:
     """One arm.
 
     title: shown in the report. options: of lerobot-train, without the dashes. cameras: range of camera poses in its
-    training data. depth: whether it reads depth. Faults of the depth sensor do not affect an arm that does not.
+    training data. reads: depth, and the camera's pose. A fault of what an arm does not read does not affect it.
+    adapts: the arm whose trained policy is adapted to each condition with one demonstration; None: trained itself.
     """
 
     title: str
     options: dict[str, str] = field(default_factory=dict)
     cameras: str = "train"
-    depth: bool = True
+    reads: frozenset[str] = frozenset()
+    adapts: str | None = None
 
 
-def _geometry(title: str, **changes: str) -> Arm:
+def _geometry(title: str, reads: frozenset[str] = frozenset({DEPTH, POSE}), **changes: str) -> Arm:
     options = {"geometry_source": "rgbd", **changes}
-    return Arm(title, {f"policy.{name}": value for name, value in options.items()})
+    return Arm(title, {f"policy.{name}": value for name, value in options.items()}, reads=reads)
 
 
-def _no_depth(title: str, source: str, cameras: str = "train", **options: str) -> Arm:
-    return Arm(title, {"policy.geometry_source": source, **options}, cameras, depth=False)
-
+_NO_GEOMETRY = {"policy.geometry_source": "none"}
 
 ARMS = {
-    "blind": _no_depth("no camera: the blind floor", "none", **{"policy.input_features": BLIND_INPUTS}),
-    "rgb": _no_depth("RGB only: plain π0.5", "none"),
-    "rgb-wide": _no_depth("RGB only, trained on the wide camera range", "none", cameras="wide"),
+    "blind": Arm("no camera: the blind floor", {**_NO_GEOMETRY, "policy.input_features": BLIND_INPUTS}),
+    "rgb": Arm("RGB only: plain π0.5", _NO_GEOMETRY),
+    "rgb-wide": Arm("RGB only, trained on the wide camera range", _NO_GEOMETRY, cameras="wide"),
+    "rgb+rays": Arm("RGB, and camera rays without depth", {"policy.geometry_source": "rays"}, reads=frozenset({POSE})),
+    "rgb+modulation": Arm(
+        "RGB only, its visual tokens adapted to each condition with one demonstration", _NO_GEOMETRY, adapts="rgb"
+    ),
     "geometry": _geometry("RGB, and a geometry segment from depth: the default"),
-    "random": _no_depth("RGB, and as many constant random tokens", "random"),
+    "random": Arm("RGB, and as many constant random tokens", {"policy.geometry_source": "random"}),
     "prefix": _geometry("geometry among the VLM's own tokens", geometry_placement="prefix"),
     "gate-closed": _geometry("gate started almost shut", geometry_gate_openness="3e-4"),
     "flow-time": _geometry("segment conditioned on the current flow time", geometry_time="denoise"),
     "own-expert": _geometry("an expert of its own for geometry", geometry_expert="own"),
     "dropout": _geometry("geometry masked in half of the training samples", geometry_dropout="0.5"),
     "parallel": _geometry("parallel positions", geometry_positions="parallel"),
-    "camera-frame": _geometry("points in the camera's frame", geometry_frame="camera"),
+    "camera-frame": _geometry("points in the camera's frame", frozenset({DEPTH}), geometry_frame="camera"),
     "grid-4": _geometry("4 x 4 cells", geometry_grid="4"),
     "grid-14": _geometry("14 x 14 cells", geometry_grid="14"),
 }

@@ -2,38 +2,60 @@
 
 from dataclasses import dataclass
 
+from ..sim.cameras import azimuth_range, find_range
+from .arms import DEPTH, POSE, Arm
+
+_AZIMUTH = "azimuth"
+
 
 @dataclass(frozen=True)
 class Condition:
-    """One condition. cameras: range of camera poses (sim/cameras.py). sensor: depth sensor (sim/sensor.py)."""
+    """One condition. cameras: range of camera poses (sim/cameras.py). sensor: depth sensor (sim/sensor.py).
+
+    changes: what the sensor's fault changes, depth or the camera's pose; None for an ideal sensor.
+    """
 
     title: str
     cameras: str = "train"
     sensor: str = "ideal"
+    changes: str | None = None
 
 
 CONDITIONS = {
     "inside": Condition("camera within the training range"),
     "outside": Condition("camera outside the training range", cameras="outside"),
     "far": Condition("camera far outside the training range", cameras="far"),
-    "noise": Condition("depth with a structured-light sensor's noise and holes", sensor="noisy"),
-    "depth-off": Condition("depth camera off", sensor="off"),
-    "calibration-1": Condition("calibration wrong by 1 degree and 1 cm", sensor="calibration-1"),
-    "calibration-2": Condition("calibration wrong by 2 degrees and 2 cm", sensor="calibration-2"),
-    "calibration-5": Condition("calibration wrong by 5 degrees and 5 cm", sensor="calibration-5"),
+    "noise": Condition("depth with a structured-light sensor's noise and holes", sensor="noisy", changes=DEPTH),
+    "depth-off": Condition("depth camera off", sensor="off", changes=DEPTH),
+    "calibration-1": Condition("calibration wrong by 1 degree and 1 cm", sensor="calibration-1", changes=POSE),
+    "calibration-2": Condition("calibration wrong by 2 degrees and 2 cm", sensor="calibration-2", changes=POSE),
+    "calibration-5": Condition("calibration wrong by 5 degrees and 5 cm", sensor="calibration-5", changes=POSE),
 }
+
+
+def azimuth_condition(degrees: float) -> str:
+    """Name of the condition with the camera at one azimuth, relative to the middle of the training range."""
+    return azimuth_range(degrees)
+
+
+def azimuth_of(name: str) -> float | None:
+    """Azimuth of a condition of `azimuth_condition`, in degrees; None for any other condition."""
+    return float(name.removeprefix(_AZIMUTH)) if name.startswith(_AZIMUTH) else None
 
 
 def find_condition(name: str) -> Condition:
     """The condition of this name. Raises ValueError that lists the known names."""
-    if name not in CONDITIONS:
-        raise ValueError(f"There is no condition '{name}'; choose one of: {', '.join(CONDITIONS)}.")
-    return CONDITIONS[name]
+    if name in CONDITIONS:
+        return CONDITIONS[name]
+    if name.startswith(_AZIMUTH):
+        find_range(name)
+        return Condition(f"camera at {name.removeprefix(_AZIMUTH)} degrees", cameras=name)
+    raise ValueError(f"There is no condition '{name}'; choose one of: {', '.join(CONDITIONS)}.")
 
 
-def equivalent_condition(name: str, depth: bool) -> str:
-    """The condition to evaluate instead: an arm without depth observes the same under every depth sensor."""
+def equivalent_condition(name: str, arm: Arm) -> str:
+    """The condition to evaluate instead: a fault of what an arm does not read changes nothing for it."""
     condition = find_condition(name)
-    if depth or condition.sensor == "ideal":
+    if condition.changes is None or condition.changes in arm.reads:
         return name
-    return next(n for n, c in CONDITIONS.items() if c.cameras == condition.cameras and c.sensor == "ideal")
+    return next(n for n, c in CONDITIONS.items() if c.cameras == condition.cameras and c.changes is None)

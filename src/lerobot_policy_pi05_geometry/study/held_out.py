@@ -23,7 +23,7 @@ from torch.utils.data import default_collate
 
 from ..checkpoint.load import LoadedPolicy, load_policy
 from ..geometry.keys import DEPTH_SUFFIX, depth_features, find_depth_key, is_depth_key
-from .arms import find_arm
+from .arms import DEPTH, find_arm
 from .runs import ReportProgress, Run, option_list, versions
 from .training import train_with
 
@@ -72,7 +72,7 @@ class HeldOutRun(Run):
         return {"condition": condition, "frames": self.frames}
 
     def distinct_conditions(self) -> list[str]:
-        return list(self.conditions) if self.arm.depth else [ALL_CAMERAS]
+        return list(self.conditions) if DEPTH in self.arm.reads else [ALL_CAMERAS]
 
     def prepare(self, report_progress: ReportProgress) -> None:
         """Nothing to prepare: the dataset exists."""
@@ -128,7 +128,7 @@ class HeldOutRun(Run):
 
     def errors(self, condition: str) -> np.ndarray | None:
         """Mean error per held-out episode, horizon step and action dimension, (E, S, D); None before evaluation."""
-        path = self.outcome(condition if self.arm.depth else ALL_CAMERAS)
+        path = self.outcome(condition if DEPTH in self.arm.reads else ALL_CAMERAS)
         if not path.exists():
             return None
         with np.load(path, allow_pickle=False) as file:
@@ -171,10 +171,10 @@ def held_out_runs(
     if not 0 < held_out < 1:
         raise ValueError(f"The share of held-out episodes must be between 0 and 1, got {held_out}.")
     for name in arms:
-        if find_arm(name).cameras != "train":
+        if find_arm(name).cameras != "train" or find_arm(name).adapts is not None:
             raise ValueError(f"Arm '{name}' needs other camera poses in its data, which only the simulator has.")
     views = view_conditions(dataset_root, repo_id)
-    if len(views) == 1 and any(find_arm(name).depth for name in arms):
+    if len(views) == 1 and any(DEPTH in find_arm(name).reads for name in arms):
         raise ValueError(
             f"{dataset_root} has no depth (observation.images.<camera>{DEPTH_SUFFIX}), which arm 'geometry' and its variants "
             "read; record depth, or choose other --arms."

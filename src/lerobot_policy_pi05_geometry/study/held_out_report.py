@@ -8,8 +8,8 @@ import pandas as pd
 from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 
+from ..inspect.charts import curves_figure, horizon_figure
 from ..inspect.page import Page, picture
-from ..inspect.pictures import curves_figure, horizon_figure
 from .arms import ARMS
 from .held_out import ALL_CAMERAS, NO_DEPTH, ONLY, HeldOutRun
 from .statistics import bootstrap

@@ -6,6 +6,7 @@ output folder and do not communicate otherwise.
 """
 
 import json
+import logging
 import os
 import subprocess
 import sys
@@ -18,6 +19,9 @@ from .runs import Run
 from .training_log import TrainingCurve
 from .worker import PROGRESS
 
+logger = logging.getLogger(__name__)
+
+_POLL = 2.0  # seconds between two checks of the shared folder
 _EVALUATION_COST = 2.5  # of one episode or frame, in training steps; for the estimate of the remaining time
 _CRASH_LOG_CHARACTERS = 2_000  # kept from the end of a crashed run's log
 
@@ -62,7 +66,12 @@ class Progress:
 
 def share(runs: Sequence[Run]) -> list[Run]:
     """The runs of this rank: every WORLD_SIZE-th, or all without a launcher."""
-    return list(runs)[int(os.environ.get("RANK", "0")) :: int(os.environ.get("WORLD_SIZE", "1"))]
+    return list(runs)[rank() :: int(os.environ.get("WORLD_SIZE", "1"))]
+
+
+def rank() -> int:
+    """This process's rank under a launcher; 0 without one."""
+    return int(os.environ.get("RANK", "0"))
 
 
 def default_workers() -> int:
@@ -78,7 +87,7 @@ def launch(
     A run that crashes is recorded (`crashed.json` beside its log) and the others continue. It is tried again only with
     `retry_crashed`. On an interrupt the processes are terminated; finished parts are kept.
     """
-    waiting = deque(run for run in runs if run.missing() and (retry_crashed or not run.crash.exists()))
+    waiting = deque(run for run in runs if not run.complete() and (retry_crashed or not run.crash.exists()))
     threads = max(1, default_workers() // max(1, min(workers, len(waiting))))
     running: list[Job] = []
     try:
@@ -95,6 +104,20 @@ def launch(
     finally:
         for job in running:
             job.process.terminate()
+
+
+def wait_for(runs: Sequence[Run]) -> None:
+    """Wait until other ranks have finished their share of the runs; crashed runs are finished."""
+    waiting = [run for run in runs if not _finished(run)]
+    if waiting:
+        logger.warning("Waiting for %d runs of other ranks.", len(waiting))
+    while waiting:
+        time.sleep(_POLL)
+        waiting = [run for run in waiting if not _finished(run)]
+
+
+def _finished(run: Run) -> bool:
+    return run.crash.exists() or run.complete()
 
 
 def _start(run: Run, threads: int) -> Job:

@@ -9,9 +9,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors import safe_open
 
 from ..checkpoint.load import load_policy
+from ..inspect.charts import curves_figure, success_figure
 from ..inspect.inspection import frame_batch
 from ..inspect.page import Page, picture, video
-from ..inspect.pictures import curves_figure, depth_figure, layout_figure, segment_share_figure, success_figure
+from ..inspect.pictures import depth_figure, layout_figure, segment_share_figure
 from .arms import ARMS
 from .conditions import CONDITIONS
 from .results import ArmComparison, Cell, cells, comparisons, episodes_table, pooled_difference
@@ -40,8 +41,8 @@ def write_report(folder: Path, runs: Sequence[SimulatedRun], command: str) -> Pa
     _trained_policy(page, runs, pictures)
     page.heading("Limitations")
     page.text(
-        "The networks are small and trained from scratch, depth is simulated, the experts are scripted and the tasks are "
-        "few. The gain of a pretrained π0.5 on a real robot is not measured here. Wilson intervals and McNemar's test treat "
+        "The networks are small, depth is simulated, the experts are scripted and the tasks are few. The gain of the "
+        "released π0.5 on a real robot is not measured here. Wilson intervals and McNemar's test treat "
         "all episodes of an arm as independent and ignore the variation between training seeds. The intervals of differences "
         f"resample training seeds, of which there are {len({run.seed for run in runs})}. A difference with a corrected p above "
         "0.05 is not significant."
@@ -76,8 +77,23 @@ def headline(table: pd.DataFrame) -> str:
             f" The difference is {difference:+.0f} points ({low:+.0f} to {high:+.0f}, 95 % bootstrap over training seeds and "
             "episodes)."
         )
+    text += _without_depth(table)
     controls = [_control(name, rows, arm) for arm, name in _NAMES.items() if arm in arms]
     return text + (f" For comparison: {', '.join(controls)}." if controls else "")
+
+
+def _without_depth(table: pd.DataFrame) -> str:
+    """Geometry with its depth camera off, beside RGB only with the same cameras; empty if it was not evaluated."""
+    found = {
+        arm: [cell for cell in cells(table[table["condition"] == condition].assign(task="all")) if cell.arm == arm]
+        for arm, condition in (("geometry", "depth-off"), ("rgb", "inside"))
+    }
+    if not all(found.values()):
+        return ""
+    return (
+        f" With its depth camera off and the camera within the range, geometry succeeds in {_cell(found['geometry'][0])}, "
+        f"RGB only in {_cell(found['rgb'][0])}."
+    )
 
 
 def _control(name: str, rows: pd.DataFrame, arm: str) -> str:
@@ -99,7 +115,14 @@ _NAMES = {"rgb-wide": "RGB trained on the wide camera range", "random": "random 
 
 
 def _setup(page: Page, runs: Sequence[SimulatedRun]) -> None:
-    budget = runs[0].budget
+    budget, origin = runs[0].budget, runs[0].origin
+    if origin is not None:
+        about = origin.pretraining
+        page.text(
+            f"Every arm starts from one small π0.5 that was trained on RGB for {about.steps} steps ({', '.join(about.tasks)}, "
+            f"cameras '{about.cameras}', {about.episodes} expert episodes of each task), exported to LeRobot's layout and "
+            "converted for the arm."
+        )
     seeds = len({run.seed for run in runs})
     page.text(
         f"{len(runs)} training runs: {budget.episodes} expert episodes, {budget.steps} steps of {budget.batch_size} samples "

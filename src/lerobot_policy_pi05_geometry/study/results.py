@@ -17,7 +17,9 @@ from .statistics import Difference, bootstrap, compare, holm, wilson
 
 
 def episodes_table(runs: Sequence[SimulatedRun]) -> pd.DataFrame:
-    """One row per episode: task, arm, training_seed, condition, episode_seed, success, steps, crashed.
+    """One row per episode: task, arm, multiple, training_seed, condition, episode_seed, success, steps, crashed.
+
+    multiple: of the budget's training steps. steps: of the episode.
 
     Raises ValueError if a run is neither complete nor crashed.
     """
@@ -36,10 +38,10 @@ def episodes_table(runs: Sequence[SimulatedRun]) -> pd.DataFrame:
             else:
                 outcomes = list(zip(evaluation.seeds, evaluation.successes, evaluation.steps, strict=True))
             rows += [
-                (run.task, run.arm_name, run.seed, condition, seed, success, steps, crashed)
+                (run.task, run.arm_name, run.multiple, run.seed, condition, seed, success, steps, crashed)
                 for seed, success, steps in outcomes
             ]
-    columns = ["task", "arm", "training_seed", "condition", "episode_seed", "success", "steps", "crashed"]
+    columns = ["task", "arm", "multiple", "training_seed", "condition", "episode_seed", "success", "steps", "crashed"]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -71,8 +73,8 @@ def cells(table: pd.DataFrame) -> list[Cell]:
         crashed = rows.loc[rows["crashed"], "training_seed"].nunique()
         by_seed = tuple(rows.groupby("training_seed")["success"].mean())
         found.append(Cell(task, arm, condition, int(rows["success"].sum()), len(rows), crashed, by_seed))
-    order = {name: i for i, name in enumerate([*ARMS, *CONDITIONS])}
-    return sorted(found, key=lambda cell: (cell.task, order[cell.arm], order[cell.condition]))
+    arms, conditions = list(ARMS), list(CONDITIONS)
+    return sorted(found, key=lambda cell: (cell.task, arms.index(cell.arm), conditions.index(cell.condition)))
 
 
 @dataclass(frozen=True)
@@ -91,11 +93,11 @@ def comparisons(table: pd.DataFrame, reference: str = "geometry") -> list[ArmCom
     """Every arm against the reference arm, on the same seeds, per task and condition."""
     found: list[tuple[str, str, str, Difference]] = []
     for (task, condition), rows in table.groupby(["task", "condition"], sort=False):
-        grids = {arm: grid(of_arm) for arm, of_arm in rows.groupby("arm", sort=False)}
-        if reference in grids:
+        matrices = {arm: success_matrix(of_arm) for arm, of_arm in rows.groupby("arm", sort=False)}
+        if reference in matrices:
             found += [
-                (task, condition, arm, compare(grids[reference], grid))
-                for arm, grid in grids.items()
+                (task, condition, arm, compare(matrices[reference], matrix))
+                for arm, matrix in matrices.items()
                 if arm != reference
             ]
     corrected = holm([difference.p for *_, difference in found])
@@ -107,10 +109,12 @@ def comparisons(table: pd.DataFrame, reference: str = "geometry") -> list[ArmCom
 
 def pooled_difference(rows: pd.DataFrame, arm: str, over: str) -> tuple[float, float, float]:
     """Success of one arm minus another's, averaged over the tasks in `rows` (of one condition): mean, low, high."""
-    grids = [[grid(of_task[of_task["arm"] == name]) for name in (arm, over)] for _, of_task in rows.groupby("task")]
-    return bootstrap(*(first.astype(float) - second.astype(float) for first, second in grids))
+    pairs = [
+        [success_matrix(of_task[of_task["arm"] == name]) for name in (arm, over)] for _, of_task in rows.groupby("task")
+    ]
+    return bootstrap(*(first.astype(float) - second.astype(float) for first, second in pairs))
 
 
-def grid(rows: pd.DataFrame) -> np.ndarray:
+def success_matrix(rows: pd.DataFrame) -> np.ndarray:
     """Success by (training seed, episode seed), bool."""
     return rows.pivot(index="training_seed", columns="episode_seed", values="success").to_numpy(dtype=bool)

@@ -110,6 +110,10 @@ class Run(ABC):
         """Conditions that have not been evaluated yet."""
         return [condition for condition in self.distinct_conditions() if not self.outcome(condition).exists()]
 
+    def complete(self) -> bool:
+        """Whether it is trained and evaluated under all its conditions."""
+        return self.checkpoint.exists() and not self.missing()
+
     def to_json(self) -> str:
         """The run as JSON, for its worker."""
         return json.dumps({"kind": type(self).__name__, **asdict(self)}, default=str)

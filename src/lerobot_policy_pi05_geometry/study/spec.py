@@ -5,6 +5,16 @@ seeds = [0, 1, 2]
 [budget]                        # any field of `Budget`; other fields keep their defaults
 steps = 1500
 
+[pretrain]                      # optional: train a π0.5 on RGB first, and start every arm from it (`Pretraining`)
+tasks = ["faucet-open-wide", "coffee-button-wide"]
+
+[growth]                        # optional: train with multiples of the budget's steps, until success stops growing (`Growth`)
+multiples = [1, 2, 4]
+
+[sweep]                         # optional: evaluate the longest training of these arms at these azimuths (`Sweep`)
+azimuths = [-60, -30, 0, 30, 60]
+arms = ["rgb", "geometry"]
+
 [[compare]]                     # any number of blocks; an arm in two of them is trained once, for the conditions of both
 tasks = ["button-press-topdown-wide"]
 arms = ["blind", "rgb", "geometry"]
@@ -16,6 +26,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from ..sim.cameras import find_range
 from ..sim.tasks import find_task
 from .arms import find_arm
 from .conditions import find_condition
@@ -39,7 +50,63 @@ class Budget:
     evaluation_episodes: int = 50
     parallel: int = 10  # episodes stepped together
     videos: int = 2  # episodes of each cell whose frames are kept
+    adaptation_steps: int = 200  # of an arm that is adapted with one demonstration
     device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class Pretraining:
+    """A π0.5 trained on RGB, from which every arm is fine-tuned. Network and batch size are the budget's.
+
+    cameras: range of camera poses. episodes: expert episodes of each task. seed: of the training. evaluated: tasks on which
+    the trained π0.5 is evaluated, for the report.
+    """
+
+    tasks: tuple[str, ...]
+    cameras: str = "wide"
+    episodes: int = 100
+    steps: int = 6000
+    learning_rate: float = 1e-3
+    seed: int = 0
+    evaluated: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.tasks:
+            raise ValueError("[pretrain] needs at least one task.")
+        unknown = sorted(set(self.evaluated) - set(self.tasks))
+        if unknown:
+            raise ValueError(f"[pretrain] evaluates {', '.join(unknown)}, on which it is not trained.")
+        for task in self.tasks:
+            find_task(task)
+        find_range(self.cameras)
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Budgets of a study, as multiples of the budget's steps, and the rule by which an arm gets the next one.
+
+    Each multiple is a training of its own with its own learning-rate schedule, as a user with so many steps gets it. An arm
+    has stopped improving when the gain from one multiple to the next, pooled over training seeds and tasks, is below
+    `gain` under each of the conditions; then larger multiples are not trained.
+    """
+
+    multiples: tuple[int, ...] = (1,)
+    gain: float = 0.05
+    conditions: tuple[str, ...] = ("inside", "outside")
+
+    def __post_init__(self) -> None:
+        if not self.multiples or list(self.multiples) != sorted(set(self.multiples)) or self.multiples[0] < 1:
+            raise ValueError(f"[growth] multiples must be whole numbers that rise from 1 on, got {self.multiples}.")
+        for name in self.conditions:
+            find_condition(name)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Azimuths (degrees, relative to the middle of the training range) at which arms are evaluated at the end."""
+
+    azimuths: tuple[float, ...]
+    arms: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -58,15 +125,29 @@ class StudySpec:
     seeds: tuple[int, ...]
     comparisons: tuple[Comparison, ...]
     budget: Budget = Budget()
+    pretraining: Pretraining | None = None
+    growth: Growth = Growth()
+    sweep: Sweep | None = None
 
     def __post_init__(self) -> None:
         if not self.seeds or not self.comparisons:
             raise ValueError("A study needs at least one training seed and one [[compare]] block.")
         for comparison in self.comparisons:
             for name in comparison.arms:
-                find_arm(name)
+                adapted = find_arm(name).adapts
+                if adapted is not None and adapted not in comparison.arms:
+                    raise ValueError(f"Arm '{name}' adapts arm '{adapted}'; name both in the same [[compare]] block.")
             for name in comparison.conditions:
                 find_condition(name)
+            if len(self.growth.multiples) > 1 and not set(self.growth.conditions) <= set(comparison.conditions):
+                raise ValueError(
+                    f"[growth] decides by the conditions {', '.join(self.growth.conditions)}; name them in every [[compare]] "
+                    "block."
+                )
+        arms = {name for comparison in self.comparisons for name in comparison.arms}
+        missing = sorted(set(self.sweep.arms) - arms) if self.sweep is not None else []
+        if missing:
+            raise ValueError(f"[sweep] names {', '.join(missing)}, which no [[compare]] block trains.")
 
 
 def read_spec(path: str | Path) -> StudySpec:
@@ -84,7 +165,7 @@ def read_spec(path: str | Path) -> StudySpec:
         content = tomllib.loads(file.read_text())
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{file} is not valid TOML: {error}.") from error
-    _check_keys(content, {"seeds", "budget", "compare"}, str(file))
+    _check_keys(content, {"seeds", "budget", "pretrain", "growth", "sweep", "compare"}, str(file))
     comparisons = []
     for block in content.get("compare", []):
         _check_keys(block, {f.name for f in fields(Comparison)}, f"[[compare]] of {file}")
@@ -95,9 +176,26 @@ def read_spec(path: str | Path) -> StudySpec:
         for task in lists["tasks"]:
             find_task(task)
         comparisons.append(Comparison(**lists))
-    budget = content.get("budget", {})
-    _check_keys(budget, {f.name for f in fields(Budget)}, f"[budget] of {file}")
-    return StudySpec(tuple(content.get("seeds", ())), tuple(comparisons), Budget(**budget))
+    return StudySpec(
+        tuple(content.get("seeds", ())),
+        tuple(comparisons),
+        _section(content, "budget", Budget, file) or Budget(),
+        _section(content, "pretrain", Pretraining, file),
+        _section(content, "growth", Growth, file) or Growth(),
+        _section(content, "sweep", Sweep, file),
+    )
+
+
+def _section[T](content: dict[str, Any], name: str, kind: type[T], file: Path) -> T | None:
+    """A table of the file as a dataclass, lists as tuples; None if the file has no such table."""
+    if name not in content:
+        return None
+    values = content[name]
+    _check_keys(values, {f.name for f in fields(kind)}, f"[{name}] of {file}")  # type: ignore[arg-type]
+    try:
+        return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
+    except TypeError as error:
+        raise ValueError(f"[{name}] of {file} is incomplete: {error}.") from error
 
 
 def _check_keys(content: dict[str, Any], known: set[str], where: str) -> None:

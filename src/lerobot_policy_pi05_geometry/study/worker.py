@@ -11,13 +11,18 @@ import shutil
 import sys
 from pathlib import Path
 
-from . import held_out, simulated
+from . import adapted, held_out, pretraining, simulated
 from .locks import folder_lock
 from .runs import Run
 
 logger = logging.getLogger(__name__)
 PROGRESS = "progress:"  # followed by stage and count: "progress: evaluate outside 10/50"
-_KINDS = {"SimulatedRun": simulated.from_json, "HeldOutRun": held_out.from_json}
+_KINDS = {
+    "PretrainingRun": pretraining.from_json,
+    "SimulatedRun": simulated.from_json,
+    "AdaptedRun": adapted.from_json,
+    "HeldOutRun": held_out.from_json,
+}
 
 
 def execute(run: Run) -> None:

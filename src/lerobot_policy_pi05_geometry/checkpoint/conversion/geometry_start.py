@@ -7,6 +7,7 @@ from typing import Any
 
 from ...configuration_pi05_geometry import DEFAULT_ENCODER, PI05GeometryConfig
 from ...geometry import read_calibration_file
+from ...geometry.resolve import FROM_RGB
 
 # Logits on keys that the network has never seen may be well above those on the ones it has: with random weights and an openness
 # of 3e-4, actions moved by up to 0.1, at 6e-6 by 3e-3, at 1e-7 by 5e-5 (docs/results.md). Invariant 9 allows 1e-3.
@@ -14,7 +15,7 @@ SHUT = 1e-7
 # A policy that acts from RGB takes geometry up only if the gate moves fast and images are missing often enough: neither alone
 # did (docs/results.md, "Warm start").
 TAKE_UP = {"geometry_lr": 3e-3, "geometry_gate_lr": 5e-2, "image_dropout": 0.4, "geometry_dropout": 0.2}
-SOURCES = ("rgbd", "da3", "features", "random", "none")
+SOURCES = ("rgbd", "da3", "features", "random", "rays", "none")
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,7 @@ class GeometryStart:
         """
         source = self.source or "rgbd"
         self.check(source)
-        from_rgb = source in ("da3", "features")
-        known = source == "none" or (from_rgb and has_images)
+        known = source == "none" or (source in FROM_RGB and has_images)
         return {
             "geometry_source": source,
             "geometry_cameras": None if self.cameras is None else list(self.cameras),
@@ -69,7 +69,7 @@ class GeometryStart:
             "geometry_gate_openness": SHUT if self.openness is None else self.openness,
             "geometry_positions": "parallel",
             "padded_actions": "supervised",  # as it was trained
-            "da3_encoder": (self.encoder or DEFAULT_ENCODER) if from_rgb else None,
+            "da3_encoder": (self.encoder or DEFAULT_ENCODER) if source in ("da3", "features") else None,
             **TAKE_UP,
         }
 

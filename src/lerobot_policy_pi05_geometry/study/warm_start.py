@@ -1,0 +1,40 @@
+"""Where a fine-tuning begins: a π0.5 checkpoint converted for an arm, as a user does it with `pi05-geometry convert`."""
+
+import shutil
+from pathlib import Path
+
+from ..checkpoint.conversion import GeometryStart, convert
+from ..sim.environment import CAMERA
+from .arms import Arm
+from .locks import folder_lock
+
+# Options that `convert` decides, since they define new weights.
+_CONVERTED = ("geometry_source", "geometry_grid", "geometry_frame", "geometry_expert")
+
+
+def geometry_start(arm: Arm) -> GeometryStart:
+    """The geometry that an arm's checkpoint is converted to."""
+    source, grid, frame, expert = (arm.options.get(f"policy.{name}") for name in _CONVERTED)
+    return GeometryStart(
+        source,
+        cameras=None if source == "none" else (CAMERA,),
+        grid=None if grid is None else int(grid),
+        frame=frame,
+        expert=expert,
+    )
+
+
+def remaining_options(arm: Arm) -> dict[str, str]:
+    """Options of an arm that are given to lerobot-train after the conversion."""
+    return {name: value for name, value in arm.options.items() if name.removeprefix("policy.") not in _CONVERTED}
+
+
+def make_start(pi05: Path, folder: Path, arm: Arm, seed: int) -> None:
+    """Convert a π0.5 checkpoint for an arm, unless the folder exists. seed: draws the new parameters."""
+    with folder_lock(folder):
+        if folder.exists():
+            return
+        unfinished = folder.with_name(f".{folder.name}.unfinished")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        convert(pi05, unfinished, geometry_start(arm), features_from_data=True, seed=seed)
+        unfinished.rename(folder)

@@ -1,0 +1,73 @@
+"""Claims against tables of episodes: thresholds, intervals, and the factor by which geometry learns faster."""
+
+import pandas as pd
+import pytest
+
+from lerobot_policy_pi05_geometry.study.claims import claims, speed_factor
+
+EPISODES = 50
+
+
+def episodes(cells: dict[tuple[str, str, int], float]) -> pd.DataFrame:
+    """cells: (arm, condition, multiple) -> success rate, in each of two training seeds and two tasks."""
+    rows = [
+        (task, arm, multiple, seed, condition, episode, episode < round(rate * EPISODES))
+        for (arm, condition, multiple), rate in cells.items()
+        for task in ("a", "b")
+        for seed in (0, 1)
+        for episode in range(EPISODES)
+    ]
+    columns = ["task", "arm", "multiple", "training_seed", "condition", "episode_seed", "success"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def verdicts(**changed: float) -> list[str]:
+    rates = {
+        "geometry_outside": 0.6,
+        "rgb_outside": 0.2,
+        "geometry_inside": 0.7,
+        "rgb_inside": 0.7,
+        "off": 0.6,
+        "wide": 0.3,
+    }
+    rates |= changed
+    table = episodes(
+        {
+            ("geometry", "outside", 1): rates["geometry_outside"],
+            ("rgb", "outside", 1): rates["rgb_outside"],
+            ("geometry", "inside", 1): rates["geometry_inside"],
+            ("rgb", "inside", 1): rates["rgb_inside"],
+            ("geometry", "depth-off", 1): rates["off"],
+            ("rgb-wide", "outside", 1): rates["wide"],
+        }
+    )
+    return [claim.verdict for claim in claims(table, table, 1500)]
+
+
+def test_each_claim_stands_on_its_own_figure():
+    """Outside, inside, depth off, then the three rivals, of which one is in the table."""
+    rest = ["not tested", "not tested"]
+    assert verdicts() == ["yes", "yes", "yes", "yes", *rest]
+    assert verdicts(rgb_outside=0.32) == ["no", "yes", "yes", "yes", *rest]  # apart, but not twice
+    assert verdicts(geometry_outside=0.04, rgb_outside=0.02)[0] == "no"  # twice, but not apart
+    assert verdicts(geometry_inside=0.6)[1] == "no"  # -10, with a lower bound below -10
+    assert verdicts(off=0.54) == ["yes", "yes", "no", "yes", *rest]
+    assert verdicts(wide=0.6) == ["yes", "yes", "yes", "no", *rest]
+
+
+def test_a_rival_that_reaches_geometry_gives_a_factor():
+    cells = {("geometry", "outside", m): r for m, r in ((1, 0.5), (2, 0.6), (4, 0.6))}
+    cells |= {("rgb-wide", "outside", m): r for m, r in ((1, 0.2), (2, 0.4), (4, 0.6))}
+    table = episodes(cells)
+    assert speed_factor(table, "rgb-wide") == (4, 2)
+    final = table[table["multiple"] == 4]
+    sentence = next(c.sentence for c in claims(final, table, 1500) if c.claim.startswith("rgb-wide"))
+    assert "3,000 steps instead of 6,000: it learns 2 times as fast" in sentence
+    never = episodes({("geometry", "outside", 1): 0.1, ("rgb-wide", "outside", 1): 0.2})
+    assert speed_factor(never, "rgb-wide") is None
+
+
+@pytest.mark.parametrize("missing", ["geometry", "rgb"])
+def test_what_was_not_run_is_not_claimed(missing):
+    table = episodes({(arm, "outside", 1): 0.5 for arm in {"geometry", "rgb"} - {missing}})
+    assert {claim.verdict for claim in claims(table, table, 1500)} == {"not tested"}

@@ -1,0 +1,153 @@
+"""Phases of a study, its stop rule, its report and its estimate, on outcomes that are made up: nothing is trained."""
+
+import dataclasses
+
+import pandas as pd
+import pytest
+
+from lerobot_policy_pi05_geometry.study.adapted import AdaptedRun
+from lerobot_policy_pi05_geometry.study.estimate import Costs, estimate
+from lerobot_policy_pi05_geometry.study.growth_report import write_growth_report
+from lerobot_policy_pi05_geometry.study.plan import phases, runs_of
+from lerobot_policy_pi05_geometry.study.pretraining import PretrainingRun
+from lerobot_policy_pi05_geometry.study.results import episodes_table
+from lerobot_policy_pi05_geometry.study.spec import Budget, Comparison, Growth, Pretraining, StudySpec, Sweep
+from lerobot_policy_pi05_geometry.study.stopping import gains, improving_arms
+
+from .fakes import fake_outcomes
+
+pytestmark = pytest.mark.sim
+
+TASKS = ("button-press-topdown-wide", "button-press-wide")
+SPEC = StudySpec(
+    seeds=(0, 1),
+    comparisons=(
+        Comparison(TASKS, ("blind", "rgb", "geometry"), ("inside", "outside", "depth-off")),
+        Comparison(TASKS, ("rgb", "rgb-wide", "rgb+rays", "rgb+modulation"), ("inside", "outside")),
+    ),
+    budget=Budget(steps=10, evaluation_episodes=20, episodes=3, adaptation_steps=7),
+    pretraining=Pretraining(
+        ("faucet-open-wide", "handle-press-wide"), episodes=4, steps=30, evaluated=("faucet-open-wide",)
+    ),
+    growth=Growth((1, 2, 4)),
+    sweep=Sweep((-30, 0, 30), ("rgb", "geometry", "rgb+modulation")),
+)
+
+
+def grows(run, condition: str) -> float:
+    """RGB goes on improving inside; geometry improves once; the others never do."""
+    if isinstance(run, PretrainingRun):
+        return 0.5
+    if run.arm_name in ("rgb", "rgb+modulation"):
+        return 0.2 + (0.1 * run.multiple if condition == "inside" else 0.0)
+    if run.arm_name == "geometry":
+        return 0.3 if condition == "depth-off" else 0.6
+    return {"blind": 0.05, "rgb-wide": 0.3, "rgb+rays": 0.6}[run.arm_name]
+
+
+def executed(root, spec=SPEC, rate=grows) -> list:
+    done = []
+    for phase in phases(spec, root):
+        fake_outcomes(phase.runs, rate)
+        done.append(phase)
+    return done
+
+
+def test_phases_follow_each_other_and_only_improving_arms_go_on(tmp_path):
+    found = executed(tmp_path)
+    arms = [sorted({run.arm_name for run in phase.runs}) for phase in found]
+    every = ["blind", "geometry", "rgb", "rgb+rays", "rgb-wide"]
+    assert arms == [
+        ["rgb"],  # the pretraining
+        every, ["rgb+modulation"],
+        every, ["rgb+modulation"],
+        ["rgb"], ["rgb+modulation"],  # it follows the arm that it adapts
+        ["geometry", "rgb", "rgb+modulation"],
+    ]  # fmt: skip
+    assert all(isinstance(run, AdaptedRun) for run in found[2].runs)
+    assert {run.multiple for run in found[5].runs} == {4}
+    sweep = found[-1].runs
+    assert {(run.arm_name, run.multiple) for run in sweep} == {("rgb", 4), ("rgb+modulation", 4), ("geometry", 2)}
+    assert all(run.conditions == ("azimuth-30", "azimuth+0", "azimuth+30") for run in sweep)
+    trained = {run.folder for phase in found[:-1] for run in phase.runs}
+    assert {run.folder for run in sweep} <= trained  # the sweep evaluates, and trains nothing
+
+
+def test_a_crashed_pretraining_ends_the_study(tmp_path):
+    runs = next(phases(SPEC, tmp_path)).runs
+    runs[0].folder.mkdir(parents=True)
+    runs[0].crash.write_text("{}")
+    with pytest.raises(RuntimeError, match="pretraining crashed"):
+        list(phases(SPEC, tmp_path))
+
+
+@pytest.mark.parametrize(("gained", "improving"), [(0.04, set()), (0.05, {"rgb"}), (-0.2, set())])
+def test_the_stop_rule_pools_tasks_and_seeds(tmp_path, gained, improving):
+    """A gain on one task alone counts half."""
+    spec = dataclasses.replace(
+        SPEC,
+        comparisons=(Comparison(TASKS, ("rgb",), ("inside", "outside")),),
+        budget=Budget(evaluation_episodes=50),
+        sweep=None,
+    )
+
+    def rate(run, condition):
+        gain = 2 * gained if run.multiple == 2 and run.task == TASKS[0] and condition == "outside" else 0.0
+        return 0.4 + gain
+
+    runs = [run for multiple in (1, 2) for run in runs_of(spec, tmp_path, multiple)]
+    fake_outcomes(runs, rate)
+    found = gains(episodes_table(runs), spec.growth)
+    assert {gain.condition: gain.gain for gain in found} == pytest.approx({"inside": 0.0, "outside": gained})
+    assert all(gain.low <= gain.gain <= gain.high for gain in found)
+    assert improving_arms(found, spec.growth) == improving
+
+
+def test_the_report_holds_every_part(tmp_path):
+    runs = [run for phase in executed(tmp_path) for run in phase.runs]
+    page = write_growth_report(tmp_path, SPEC, runs, "pi05-geometry study").read_text()
+    assert page.count("<img ") == 1 + len(TASKS) + 1  # growth, one per task, sweep
+    for text in ("still improving", "stopped", "Azimuth sweep", "+30 points", "geometry succeeds in 60%"):
+        assert text in page, text
+    table = pd.read_csv(tmp_path / "episodes.csv")
+    assert set(table["multiple"]) == {1, 2, 4}
+    assert set(table[table["condition"] == "azimuth+30"]["arm"]) == {"rgb", "geometry", "rgb+modulation"}
+    verdicts = pd.read_csv(tmp_path / "claims.csv").set_index("claim")["verdict"]
+    assert list(verdicts) == ["yes", "yes", "no", "yes", "no", "yes"]
+
+
+def test_the_estimate_adds_up_what_is_missing(tmp_path):
+    """Counted by hand: 8 trained arm-seeds with 5 arms and 2 tasks are 20 runs for each multiple."""
+    steps = Costs(step=3600.0, episode=0.0, recording=0.0)
+    adapted = 2 * 2 * 7  # tasks x seeds x steps, for each condition
+    least = 30 + 20 * 10 * (1 + 2) + adapted * (2 + 2 + 3)  # two conditions for each multiple, three azimuths
+    most = 30 + 20 * 10 * (1 + 2 + 4) + adapted * (2 + 2 + 2 + 3)
+    found = estimate(SPEC, tmp_path, steps)
+    assert (found.least, found.most) == (pytest.approx(least), pytest.approx(most))
+    recordings = Costs(step=0.0, episode=0.0, recording=3600.0)
+    demonstrations = 2 * 2 * 2  # tasks x seeds x conditions
+    assert estimate(SPEC, tmp_path, recordings).least == pytest.approx(2 * 4 + 2 * 2 * 3 + demonstrations)
+    runs = [run for phase in executed(tmp_path) for run in phase.runs]
+    assert runs
+    left = estimate(SPEC, tmp_path, Costs(step=3600.0, episode=3600.0, recording=0.0))
+    assert left.least == pytest.approx(0.0)
+    assert left.most > 0  # arms that stopped would have had more
+
+
+def test_the_study_that_comes_along_is_the_one_that_was_promised(tmp_path):
+    from lerobot_policy_pi05_geometry.study.spec import read_spec
+
+    spec = read_spec("warm-start")
+    assert len(spec.seeds) >= 3
+    assert spec.growth == Growth((1, 2, 4), 0.05, ("inside", "outside"))
+    assert spec.budget.evaluation_episodes >= 100
+    assert spec.pretraining is not None
+    assert len(spec.pretraining.tasks) > 2
+    runs = runs_of(spec, tmp_path)
+    tasks = {run.task for run in runs}
+    assert len(tasks) >= 2
+    assert not tasks & set(spec.pretraining.tasks)  # the tasks are new
+    arms = {"blind", "rgb", "geometry", "rgb-wide", "rgb+rays", "rgb+modulation"}
+    assert {(run.task, run.arm_name) for run in runs} == {(task, arm) for task in tasks for arm in arms}
+    geometry = next(run for run in runs if run.arm_name == "geometry")
+    assert {"inside", "outside", "depth-off", "noise", "calibration-1"} <= set(geometry.conditions)
