@@ -12,7 +12,7 @@
 ```
 
 Imports run downwards only. Importing this package registers the policy types `pi05_geometry` and `pi05_geometry_remote`, the
-processor steps and the environment type `metaworld_rgbd` with LeRobot, which imports it by itself because of its name.
+processor steps and the environment types `metaworld_rgbd` and `libero_rgbd` with LeRobot, which imports it by itself because of its name.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -24,12 +24,14 @@ from .data.state_width import StateWidthStep
 from .data.tokenizer import PortableTokenizerProcessorStep
 from .serving.remote.configuration_pi05_geometry_remote import PI05GeometryRemoteConfig
 from .sim.configuration import MetaworldRgbdEnv
+from .sim.libero.configuration import LiberoRgbdEnv
 
 if TYPE_CHECKING:
     from .modeling_pi05_geometry import PI05GeometryPolicy
 
 __version__ = "0.1.0"
 __all__ = [
+    "LiberoRgbdEnv",
     "MetaworldRgbdEnv",
     "NormaliserProbeStep",
     "NormaliserScaleStep",

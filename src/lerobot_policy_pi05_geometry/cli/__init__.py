@@ -5,11 +5,11 @@
    studies       demo, study                 simulation   record, train, evaluate
    checkpoints   inspect, bench, convert, export, merge
    datasets      quantiles, store-calibration, precompute       planning     plan
-   serving       serve
+   serving       serve                       libero       libero-replay, libero-floors, libero-report
 ```
 """
 
-from . import studies, simulation, checkpoints, datasets, planning, serving  # noqa: F401, I001 (the order of --help)
+from . import studies, simulation, checkpoints, datasets, planning, serving, libero  # noqa: F401, I001 (the order of --help)
 from .app import app, console
 
 __all__ = ["app", "console"]

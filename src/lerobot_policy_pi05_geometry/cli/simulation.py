@@ -1,30 +1,58 @@
 """The commands of the simulated robot: record, train, evaluate."""
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from .app import Cameras, Output, Sensor, Task, app, console, progress_bars, require_simulator
+from .libero import Placement, Rendering, TaskIds
 
 
 @app.command()
 def record(
     output: Output,
     task: Task = "button-press-topdown-wide",
-    episodes: Annotated[int, typer.Option(help="Successful expert episodes to record.")] = 100,
-    cameras: Cameras = "train",
+    episodes: Annotated[int, typer.Option(help="Successful expert episodes to record, of each task.")] = 100,
+    cameras: Annotated[str, typer.Option(help="Range of camera poses, of the environment's own ranges.")] = "train",
     image_size: Annotated[int, typer.Option(help="Pixels per side of RGB and depth.")] = 84,
     seed: Annotated[int, typer.Option(help="Selects the recorded episodes.")] = 0,
+    env: Annotated[
+        str, typer.Option(help="metaworld_rgbd, or libero_rgbd with --task as its suite.")
+    ] = "metaworld_rgbd",
+    task_id: TaskIds = None,
+    placement: Placement = "stock",
+    rendering: Rendering = "full",
 ) -> None:
-    """Record scripted experts into a LeRobotDataset v3 with depth and calibration."""
-    require_simulator()
-    from ..sim.record import record as record_episodes
+    """Record scripted experts into a LeRobotDataset v3 with depth and calibration.
 
+    --task-id, --placement and --rendering are for libero_rgbd.
+    """
+    attempts: Iterator[tuple[int, bool]]
+    repo_id, total = f"local/{output.name}", episodes
+    if env == "metaworld_rgbd":
+        require_simulator()
+        from ..sim.record import record as record_episodes
+
+        attempts = record_episodes(output, repo_id, task, episodes, cameras, image_size, seed=seed)
+    elif env == "libero_rgbd":
+        from ..sim.libero.environment import RgbdLiberoEnv
+        from ..sim.libero.record import record as record_libero
+        from ..sim.libero.tasks import suite_tasks
+
+        environments = [
+            RgbdLiberoEnv(task, number, cameras, placement, image_size=image_size, rendering=rendering)
+            for number in (task_id or range(len(suite_tasks(task))))
+        ]
+        total = episodes * len(environments)
+        attempts = record_libero(output, repo_id, environments, episodes, seed)
+    else:
+        raise typer.BadParameter(f"There is no environment '{env}' to record; choose metaworld_rgbd or libero_rgbd.")
     with progress_bars() as bars:
-        bar = bars.add_task("record expert episodes", total=episodes)
-        for done, _ in record_episodes(output, f"local/{output.name}", task, episodes, cameras, image_size, seed=seed):
+        bar = bars.add_task("record expert episodes", total=total)
+        for done, _ in attempts:
             bars.update(bar, completed=done)
     console.print(
         f"Train on it: lerobot-train --policy.type=pi05_geometry --dataset.repo_id=local/{output.name} "

@@ -9,10 +9,15 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .tasks import LiberoTask
+
+if TYPE_CHECKING:
+    from .expert.world import Memory
+    from .scene import LiberoScene
 
 FLOORS_FILE = Path(__file__).parent / "floors.json"
 FIRST_SEED = 700_000  # apart from evaluation (0) and recording (1,000,000)
@@ -22,7 +27,8 @@ FIRST_SEED = 700_000  # apart from evaluation (0) and recording (1,000,000)
 class Floor:
     """Successes of the expert and of the blind plan in `episodes` episodes each, on the same seeds.
 
-    steps: mean length of the expert's successful episodes. seconds: processor time of an expert's episode.
+    blind: None where it was not measured. steps: mean length of the expert's successful episodes. seconds: processor time
+    of an expert's episode.
     """
 
     suite: str
@@ -31,12 +37,13 @@ class Floor:
     placement: str
     episodes: int
     expert: int
-    blind: int
+    blind: int | None
     steps: float
     seconds: float
 
     def __str__(self) -> str:
-        return f"blind plan {self.blind}/{self.episodes}, expert {self.expert}/{self.episodes}"
+        blind = "not measured" if self.blind is None else f"{self.blind}/{self.episodes}"
+        return f"blind plan {blind}, expert {self.expert}/{self.episodes}"
 
 
 def read_floors(path: Path = FLOORS_FILE) -> dict[tuple[str, int, str], Floor]:
@@ -45,36 +52,55 @@ def read_floors(path: Path = FLOORS_FILE) -> dict[tuple[str, int, str], Floor]:
     return {(floor.suite, floor.index, floor.placement): floor for floor in floors}
 
 
-def measure(task: LiberoTask, placement: str, episodes: int, say: Callable[[str], None] = lambda text: None) -> Floor:
-    """Run the expert and the blind plan on one task, without rendering."""
-    from .expert.expert import Expert
+def measure(
+    task: LiberoTask,
+    placement: str,
+    episodes: int,
+    who: tuple[str, ...] = ("expert", "blind"),
+    say: Callable[[str], None] = lambda text: None,
+) -> Floor:
+    """Run the expert, and the blind plan if `who` names it, on one task, without rendering."""
     from .expert.world import Memory
     from .scene import LiberoScene
 
     scene = LiberoScene(task, cameras=())
     try:
-        memory = Memory.of(scene, placement)
-        counts, steps, seconds = {"expert": 0, "blind": 0}, [], 0.0
-        for seed in range(FIRST_SEED, FIRST_SEED + episodes):
-            for who, known in (("expert", None), ("blind", memory)):
+        known = {"expert": None, "blind": Memory.of(scene, placement) if "blind" in who else None}
+        counts, steps, seconds = dict.fromkeys(who, 0), [], 0.0
+        for episode in range(episodes):
+            for name in who:
                 started = time.process_time()
-                scene.reset(seed, placement)
-                expert, success = Expert(scene, known), False
-                for step in range(task.max_steps):
-                    _, success = scene.step(expert.act())
-                    if success:
-                        break
-                counts[who] += success
-                if who == "expert":
+                length = _run(scene, FIRST_SEED + episode, placement, known[name])
+                counts[name] += length is not None
+                if name == "expert":
                     seconds += time.process_time() - started
-                    steps += [step + 1] if success else []
-            say(f"{task.key} {placement}: {seed - FIRST_SEED + 1} of {episodes}")
+                    steps += [length] if length is not None else []
+            say(f"{task.key} {placement}: {episode + 1} of {episodes}")
     finally:
         scene.close()
-    mean = float(np.mean(steps)) if steps else 0.0
     return Floor(
-        task.suite, task.index, task.name, placement, episodes, **counts, steps=round(mean), seconds=round(seconds / episodes, 1)
+        task.suite,
+        task.index,
+        task.name,
+        placement,
+        episodes,
+        counts["expert"],
+        counts.get("blind"),
+        steps=round(float(np.mean(steps))) if steps else 0,
+        seconds=round(seconds / episodes, 1),
     )
+
+
+def _run(scene: "LiberoScene", seed: int, placement: str, memory: "Memory | None") -> int | None:
+    """Steps until an expert (with a memory: a blind plan) reaches the goal, or None."""
+    from .expert.expert import Expert
+
+    scene.reset(seed, placement)
+    expert = Expert(scene, memory)
+    for step in range(scene.task.max_steps):
+        if scene.step(expert.act())[1]:
+            return step + 1
+    return None
 
 
 def write_floors(floors: list[Floor], path: Path) -> None:

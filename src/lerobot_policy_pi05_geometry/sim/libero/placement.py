@@ -52,10 +52,24 @@ def body_points(model, data, body: int) -> np.ndarray:
 
 def movable(scene: LiberoScene) -> list[str]:
     """Objects of interest that stand on the table or the floor themselves: those that can be placed anew."""
-    interest = {name for name in scene.env.obj_of_interest if name in scene.env.objects_dict}
-    surface = float(scene.env.workspace_offset[2])
-    boxes = rectangles(scene)
-    return [name for name in scene.env.objects_dict if name in interest and boxes[name][0, 2] < surface + 0.02]
+    problem = scene.env.parsed_problem
+    found = []
+    for relation, *names in problem["initial_state"]:
+        if relation != "on" or names[0] not in scene.env.objects_dict or names[1] not in problem["regions"]:
+            continue
+        on_surface = problem["regions"][names[1]]["target"] == scene.env.workspace_name
+        if on_surface and names[0] in _interest(scene):
+            found.append(names[0])
+    return found
+
+
+def _interest(scene: LiberoScene) -> set[str]:
+    """Objects of interest, those among them too of which LIBERO names a part (`basket_1_contain_region`)."""
+    named = [
+        *scene.env.obj_of_interest,
+        *(name for goal in scene.env.parsed_problem["goal_state"] for name in goal[1:]),
+    ]
+    return {name for name in scene.env.objects_dict if any(other.startswith(name) for other in named)}
 
 
 def place_anew(scene: LiberoScene, spread: float, generator: np.random.Generator) -> None:

@@ -41,7 +41,7 @@ class CameraRig:
         if rendering not in RENDERINGS:
             raise ValueError(f"There is no rendering '{rendering}'; choose one of: {', '.join(RENDERINGS)}.")
         self.size, self._rendering, self._with_depth = size, rendering, depth
-        self._model = model
+        self.model = model
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, size)
         model.vis.global_.offheight = max(model.vis.global_.offheight, size)
         self._options = mujoco.MjvOption()
@@ -58,7 +58,7 @@ class CameraRig:
         }
 
     def _id(self, name: str) -> int:
-        return int(mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, CAMERAS[name]))
+        return int(mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, CAMERAS[name]))
 
     def take(self, data: Any, name: str) -> Frame:
         """What a camera sees now."""
@@ -75,12 +75,36 @@ class CameraRig:
             self._plain.enable_depth_rendering()
             depth = self._plain.render()
             self._plain.disable_depth_rendering()
-        world_t_base = np.eye(4)
-        base = data.body("robot0_base")
-        world_t_base[:3, :3], world_t_base[:3, 3] = base.xmat.reshape(3, 3), base.xpos
         world_t_camera = opencv_pose(data.cam_xpos[camera], data.cam_xmat[camera])
-        return Frame(pixels, depth, np.linalg.inv(world_t_base) @ world_t_camera)
+        return Frame(pixels, depth, np.linalg.inv(base_pose(data)) @ world_t_camera)
 
     def close(self) -> None:
         for renderer in {id(r): r for r in (self._plain, self._colour)}.values():
             renderer.close()
+
+
+def base_pose(data: Any) -> np.ndarray:
+    """Pose of the Panda's base in the world, (4, 4)."""
+    base, pose = data.body("robot0_base"), np.eye(4)
+    pose[:3, :3], pose[:3, 3] = base.xmat.reshape(3, 3), base.xpos
+    return pose
+
+
+def ray_errors(rig: CameraRig, data: Any, name: str, frame: Frame, rays: int = 64, seed: int = 0) -> np.ndarray:
+    """Distance between a frame's depth and what rays through its pixels meet, (N,) metres along the optical axis.
+
+    MuJoCo's ray casting knows nothing of rendering, so this checks depth, intrinsics and extrinsics at once. The frame
+    must have been taken of `data` as it is.
+    """
+    fx, fy, cx, cy = rig.calibration[name].intrinsics
+    pixels = np.random.default_rng(seed).integers(1, rig.size - 1, (rays, 2))
+    pose = base_pose(data) @ frame.extrinsics
+    groups = np.array([0, 1, 1, 0, 0, 0], dtype=np.uint8)  # what is drawn: no collision geometry
+    errors, geom = [], np.zeros(1, dtype=np.int32)
+    for v, u in pixels:
+        ray = np.array([(u - cx) / fx, (v - cy) / fy, 1.0])
+        direction = pose[:3, :3] @ (ray / np.linalg.norm(ray))
+        length = mujoco.mj_ray(rig.model, data, pose[:3, 3], direction, groups, 1, -1, geom)
+        if length > 0:
+            errors.append(length / np.linalg.norm(ray) - frame.depth[v, u])
+    return np.abs(errors)

@@ -4,8 +4,10 @@ import _codecs
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy._core.multiarray import _reconstruct  # type: ignore[attr-defined]
 
 from .installation import libero_files, require_libero
 
@@ -46,8 +48,8 @@ class LiberoTask:
 
         file = libero_files()[1] / self.suite / f"{self.name}.pruned_init"
         # The file is a pickled numpy array; only what such an array consists of may be loaded.
-        rebuild = (np._core.multiarray._reconstruct, "numpy.core.multiarray._reconstruct")  # numpy 1's name for it
-        allowed = [rebuild, np.ndarray, np.dtype, np.dtypes.Float64DType, _codecs.encode]
+        rebuild = (_reconstruct, "numpy.core.multiarray._reconstruct")  # numpy 1's name for it
+        allowed: list[Any] = [rebuild, np.ndarray, np.dtype, np.dtypes.Float64DType, _codecs.encode]
         with torch.serialization.safe_globals(allowed):
             states = torch.load(file, weights_only=True)
         return np.asarray(states, dtype=np.float64)

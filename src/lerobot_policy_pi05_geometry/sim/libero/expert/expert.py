@@ -6,7 +6,7 @@ import numpy as np
 
 from ..scene import LiberoScene
 from .hand import Hand
-from .skills import Style, pick, place, pull, twist
+from .skills import LIFT, Style, pick, place, pull, twist
 from .world import Memory, World
 
 KNOB_TURN = 1.1  # radians; the stove is on from 0.5
@@ -46,7 +46,7 @@ class Expert:
         for _ in range(2 if world.looks else 1):
             origin = world.position(name)
             yield from pick(hand, world, name, style)
-            held = hand.position - (world.position(name) if world.looks else origin + [0, 0, 0.06])
+            held = hand.position - (world.position(name) if world.looks else origin + np.array([0.0, 0.0, LIFT]))
             yield from place(hand, world, name, _resting_place(world, name, where), style, held)
 
 

@@ -15,6 +15,7 @@ from .world import World
 
 Actions = Iterator[np.ndarray]
 CLOSE_STEPS, OPEN_STEPS = 12, 8
+LIFT = 0.06  # metres straight up after a grasp
 LIFTED = 0.02  # metres that an object must have risen to count as held
 CLEARANCE = 0.03  # metres above what the hand or its load passes over
 
@@ -41,7 +42,7 @@ class Style:
         if self.generator is None:
             return options
         good = [grasp for grasp in options if grasp.cost < options[0].cost + 1.0]
-        self.generator.shuffle(good)
+        good = [good[i] for i in self.generator.permutation(len(good))]
         return good + options[len(good) :]
 
 
@@ -59,6 +60,10 @@ def move(
         if np.linalg.norm(position - hand.position) < tolerance and hand.angle_to(rotation) < turned:
             return
         yield hand.towards(position, rotation, speed)
+
+
+def _higher(position: np.ndarray, by: float) -> np.ndarray:
+    return position + np.array([0.0, 0.0, by])
 
 
 def grip(hand: Hand, closed: bool, steps: int) -> Actions:
@@ -91,7 +96,7 @@ def pick(hand: Hand, world: World, name: str, style: Style, tries: int = 4) -> A
         yield from _descend(hand, world, name, grasp)
         yield from grip(hand, closed=True, steps=CLOSE_STEPS)
         hand.careful = False
-        lifted = hand.position + [0, 0, 0.06]
+        lifted = _higher(hand.position, LIFT)
         yield from move(hand, lifted, grasp.rotation, 0.7, 0.015, steps=20)
         if not world.looks or world.position(name)[2] > rest[2] + LIFTED:
             return
@@ -140,7 +145,7 @@ def place(hand: Hand, world: World, name: str, target: np.ndarray, style: Style,
         yield hand.towards(_above_first(hand, goal, 0.012), rotation, 0.6)
     yield from grip(hand, closed=False, steps=OPEN_STEPS)
     hand.careful = False
-    yield from move(hand, hand.position + [0, 0, 0.10], rotation, 0.8, 0.03, steps=20)
+    yield from move(hand, _higher(hand.position, 0.10), rotation, 0.8, 0.03, steps=20)
 
 
 def pull(hand: Hand, world: World, drawer: str, style: Style, distance: float = 0.19) -> Actions:
@@ -166,7 +171,7 @@ def pull(hand: Hand, world: World, drawer: str, style: Style, distance: float = 
     hand.careful = False
     away = hand.position + 0.08 * outwards
     yield from move(hand, away, rotation, 0.8, 0.03, 0.3, steps=25)
-    yield from move(hand, away + [-0.05, 0, 0.08], hand.home, 0.8, 0.04, 0.3, steps=40)
+    yield from move(hand, away + np.array([-0.05, 0.0, 0.08]), hand.home, 0.8, 0.04, 0.3, steps=40)
 
 
 def twist(hand: Hand, world: World, knob: str, angle: float, style: Style) -> Actions:
@@ -192,7 +197,7 @@ def twist(hand: Hand, world: World, knob: str, angle: float, style: Style) -> Ac
         yield hand.towards(site, turned, 0.3)
     yield from grip(hand, closed=False, steps=OPEN_STEPS)
     hand.careful = False
-    yield from move(hand, hand.position + [0, 0, 0.1], hand.rotation, 0.8, 0.03, steps=20)
+    yield from move(hand, _higher(hand.position, 0.1), hand.rotation, 0.8, 0.03, steps=20)
 
 
 def _about_vertical(angle: float) -> np.ndarray:

@@ -33,7 +33,7 @@ class Memory:
     site_xpos: np.ndarray
 
     @classmethod
-    def of(cls, scene: LiberoScene, placement: str, layouts: int = 20, first_seed: int = 500_000) -> "Memory":
+    def of(cls, scene: LiberoScene, placement: str, layouts: int = 10, first_seed: int = 500_000) -> "Memory":
         """Remember `layouts` layouts of a placement, on seeds of its own."""
         seen = []
         for seed in range(first_seed, first_seed + layouts):
