@@ -110,7 +110,7 @@ def test_both_cameras_see_the_plate_in_one_place(environment):
     centre = scene.data.xpos[plate] - scene.base
     # Above the plate, so that the wrist camera sees it.
     for _ in range(60):
-        error = centre + [0.0, 0.0, 0.25] - (scene.data.site("gripper0_grip_site").xpos - scene.base)
+        error = centre + np.array([0.0, 0.0, 0.25]) - (scene.data.site("gripper0_grip_site").xpos - scene.base)
         environment.step(np.array([*np.clip(error / 0.05, -1, 1), 0, 0, 0, -1.0]))
     observed_now(scene)
     clouds = []

@@ -94,7 +94,7 @@ def place_anew(scene: LiberoScene, spread: float, generator: np.random.Generator
 
 
 def _free(scene: LiberoScene, boxes: dict[str, np.ndarray], shifts: dict[str, np.ndarray]) -> bool:
-    """Whether the shifted rectangles keep their distance from all others, and within reach."""
+    """Whether the shifted rectangles keep their distance from all others, at any height, and within reach."""
     moved = {name: box.copy() for name, box in boxes.items()}
     for name, shift in shifts.items():
         moved[name][:, :2] += shift
@@ -103,16 +103,12 @@ def _free(scene: LiberoScene, boxes: dict[str, np.ndarray], shifts: dict[str, np
             return False
     for name in shifts:
         for other, box in moved.items():
-            if other == name or not _same_floor(moved[name], box):
+            if other == name:
                 continue
             apart = np.maximum(moved[name][0, :2] - box[1, :2], box[0, :2] - moved[name][1, :2])
             if apart.max() < GAP:
                 return False
     return True
-
-
-def _same_floor(one: np.ndarray, other: np.ndarray) -> bool:
-    return bool(one[0, 2] < other[1, 2] and other[0, 2] < one[1, 2])
 
 
 def _shift(scene: LiberoScene, before: np.ndarray, shifts: dict[str, np.ndarray]) -> None:
