@@ -12,7 +12,8 @@
 ```
 
 Imports run downwards only. Importing this package registers the policy types `pi05_geometry` and `pi05_geometry_remote`, the
-processor steps and the environment types `metaworld_rgbd` and `libero_rgbd` with LeRobot, which imports it by itself because of its name.
+processor steps and the environment types `metaworld_rgbd` and `libero_rgbd` with LeRobot, which imports it by itself because
+of its name.
 """
 
 from typing import TYPE_CHECKING, Any
