@@ -115,7 +115,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self._noise_seed = torch.initial_seed()
         self.update_size = UpdateSize()
         self._last_share: Tensor | None = None
-        self._image_range = ImageRangeCheck()
+        self.image_range = ImageRangeCheck()
         if not self.model.action_in_proj.weight.is_meta:  # Meta tensors get their values in from_pretrained.
             self._warn_of_random_weights()
             self.to(config.device)
@@ -211,8 +211,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             raise ValueError(f"reduction must be 'mean' or 'none', got {reduction!r}.")
         size, steps, action_dim = batch[ACTION].shape
         check_actions(batch[ACTION], batch, self.config.action_feature.shape[0])
-        self._anchor(batch)  # whether the processors agree with the policy
-        self._check_images(batch)
+        anchor_of(batch, self.config.use_relative_actions)  # raises if the processors disagree with the policy
+        self.image_range(batch, self.config)
         draw = self._draw(batch, torch.Size((size, steps, self.config.max_action_dim)))
         valid = valid_steps(batch[ACTION], batch.get("action_is_pad"), self.config.padded_actions)  # (B, S)
         if self.config.rtc_training_max_delay:  # a hard prefix is no target; one valid step remains
@@ -339,7 +339,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Start an episode: the queued actions are dropped, and the next images are checked."""
         self._action_queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
-        self._image_range.reset()
+        self.image_range.reset()
         if self.geometry is not None:
             self.geometry.reset()
 
@@ -366,8 +366,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         real-time chunking's `inference_delay`, `prev_chunk_left_over` (T, A), absolute, and `execution_horizon`.
         """
         self.eval()
-        self._check_images(batch)
-        anchor = self._anchor(batch)  # (B, A)
+        self.image_range(batch, self.config)
+        anchor = anchor_of(batch, self.config.use_relative_actions)  # (B, A)
         if anchor is not None and kwargs.get("prev_chunk_left_over") is not None:
             kwargs["prev_chunk_left_over"] = relative_to(anchor, kwargs["prev_chunk_left_over"])
         images, img_masks = prepare_images(batch, self.config, self.training_step.device)
@@ -384,14 +384,6 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         )
         actions = actions[..., : self.config.action_feature.shape[0]]
         return actions if anchor is None else actions + anchor[:, None].to(actions)
-
-    def _check_images(self, batch: dict[str, Tensor]) -> None:
-        """Check the scale of the images, in the first batch after `reset`."""
-        self._image_range(batch, self.config)
-
-    def _anchor(self, batch: dict[str, Tensor]) -> Tensor | None:
-        """What to add to relative actions, (B, A); None for absolute ones."""
-        return anchor_of(batch, self.config.use_relative_actions)
 
     def _measure(self, batch: dict[str, Tensor]) -> GeometryTokens:
         assert self.geometry is not None

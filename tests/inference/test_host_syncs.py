@@ -81,7 +81,7 @@ def test_no_value_is_asked_for_and_nothing_copied(fake, changes) -> None:
         for module in [policy, *encoder.values()]:
             on_gpu(fake, module)
         batch, noise = on_gpu(fake, batch), on_gpu(fake, noise)
-        policy._image_range._done = True  # the first observation of an episode is looked into
+        policy.image_range._done = True  # the first observation of an episode is looked into
         if policy.geometry is not None:
             policy.geometry._checked = True
         if "absent_cameras" in changes:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ..configuration_pi05_geometry import PI05GeometryConfig
+from ..data.images import ImageRangeCheck
 from ..geometry import GeometryEncoder, GeometrySource
 from ..geometry.da3 import Da3Encoder
 from ..geometry.source import GeometryFeatures
@@ -40,11 +41,20 @@ class PlannedGeometry(GeometryEncoder):
         return tokens
 
 
+class PlannedImages(ImageRangeCheck):
+    """No check: the images have no values here."""
+
+    def __call__(self, batch: Mapping[str, Tensor], config: PI05GeometryConfig) -> None:
+        """Look at nothing."""
+
+
 class PlannedPolicy(PI05GeometryPolicy):
     """The real policy, but for what needs values: drawing noise, checking measurements, reading a feature store."""
 
     def __init__(self, config: PI05GeometryConfig, encoder: Da3Encoder | None) -> None:
         super().__init__(config, encoder=encoder)
+        self.image_range = PlannedImages()
+        self.config.use_relative_actions = False  # planned batches are made without processors; no memory depends on it
         if self.geometry is None:
             return
         source = self.geometry.source
@@ -53,12 +63,6 @@ class PlannedPolicy(PI05GeometryPolicy):
             cameras, optional = tuple(config.rgb_cameras()), config.optional_rgb_cameras()
             source = StoredFeatures(cameras, config.geometry_grid, encoder.variant.feature_dim, optional)
         self.geometry = PlannedGeometry(source, self.model.geometry_width)
-
-    def _anchor(self, batch: dict[str, Tensor]) -> Tensor | None:
-        return None  # planned batches are made without processors
-
-    def _check_images(self, batch: dict[str, Tensor]) -> None:
-        """Nothing: the images have no values."""
 
     def loss(self, batch: dict[str, Tensor], whole: int) -> Tensor:
         """The share of these rows in the loss of a batch of `whole` samples."""
