@@ -1,12 +1,13 @@
 """What tells a dataset, or one of its episodes, from a changed one, without reading its images."""
 
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import pyarrow.parquet as parquet
+import numpy as np
+import pyarrow
+from pyarrow import compute, parquet
 
 # Statistics of columns that say where an episode stands in the dataset, and not what is in it.
 _PLACES = ("index", "episode_index", "frame_index", "task_index", "timestamp")
@@ -41,13 +42,26 @@ def read_episodes(root: Path) -> Episodes:
         if not {_EPISODE, _LENGTH} <= set(names):
             raise ValueError(f"{path} is no table of episodes: it has no columns {_EPISODE} and {_LENGTH}.")
         columns = sorted(name for name in names if _describes_content(name))
-        rows: list[dict[str, Any]] = parquet.read_table(path, columns=[_EPISODE, *columns]).to_pylist()
-        for row in rows:
-            text = json.dumps([row[name] for name in columns], sort_keys=True)
-            digest = hashlib.sha256(f"{columns} {text}".encode()).hexdigest()[:_HASH_DIGITS]
-            found[row[_EPISODE]] = (row[_LENGTH], digest)
+        table = parquet.read_table(path, columns=[_EPISODE, *columns])
+        numbers = np.concatenate([_numbers(table[name], name, path) for name in columns], axis=1)  # (episodes, N)
+        prefix = hashlib.sha256(" ".join(columns).encode())
+        for episode, length, row in zip(table[_EPISODE].to_pylist(), table[_LENGTH].to_pylist(), numbers, strict=True):
+            digest = prefix.copy()
+            digest.update(row.tobytes())
+            found[episode] = (length, digest.hexdigest()[:_HASH_DIGITS])
     ordered = [found[episode] for episode in sorted(found)]
     return Episodes([frames for frames, _ in ordered], [digest for _, digest in ordered])
+
+
+def _numbers(column: pyarrow.ChunkedArray, name: str, path: Path) -> np.ndarray:
+    """A column of numbers, or of nested lists of them, as (rows, N) float64."""
+    array = column.combine_chunks()
+    while pyarrow.types.is_nested(array.type):
+        lengths = compute.min_max(compute.list_value_length(array))
+        if lengths["min"] != lengths["max"]:
+            raise ValueError(f"{path} is no table of episodes: its column {name} has rows of different lengths.")
+        array = array.flatten()
+    return array.to_numpy(zero_copy_only=False).astype(np.float64).reshape(len(column), -1)
 
 
 def _describes_content(column: str) -> bool:

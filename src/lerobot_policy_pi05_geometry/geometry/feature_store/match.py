@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ..da3 import default_image_size
 from ..da3.weights import backbone_hash, find_encoder
 from . import FeatureStore, Manifest, read_manifest
-from .fingerprint import changed_file, read_episodes
+from .fingerprint import Episodes, changed_file, read_episodes
 from .manifest import MANIFEST_FILE, stores_in
 
 if TYPE_CHECKING:
@@ -23,9 +23,10 @@ def open_store(config: "PI05GeometryConfig", root: Path) -> FeatureStore:
 
     Raises FileNotFoundError or ValueError, with one sentence, if there is none, it does not fit, or it is damaged.
     """
-    folder = Path(config.features_path) if config.features_path is not None else _find(config, root)
+    episodes = read_episodes(root)
+    folder = Path(config.features_path) if config.features_path is not None else _find(config, root, episodes)
     manifest = read_manifest(folder)
-    reason = misfit(config, manifest, root)
+    reason = misfit(config, manifest, root, episodes)
     if reason is not None:
         raise ValueError(f"The feature store {folder} does not fit: {reason}.")
     store = FeatureStore(folder)
@@ -33,10 +34,9 @@ def open_store(config: "PI05GeometryConfig", root: Path) -> FeatureStore:
     return store
 
 
-def misfit(config: "PI05GeometryConfig", manifest: Manifest, root: Path) -> str | None:
-    """Why a store is none for this policy and the dataset at `root`, and what to do; None if it is one."""
+def misfit(config: "PI05GeometryConfig", manifest: Manifest, root: Path, episodes: Episodes) -> str | None:
+    """Why a store does not fit this policy and the dataset at `root` with these episodes, and what to do; None if it fits."""
     anew = "run pi05-geometry precompute for it"
-    episodes = read_episodes(root)
     if episodes != manifest.episodes:
         if not episodes.begins_with(manifest.episodes):
             return f"the dataset {root} has changed since, or is another one (meta/episodes); {anew}"
@@ -89,7 +89,7 @@ def _other_encoder(config: "PI05GeometryConfig", manifest: Manifest) -> str | No
     )
 
 
-def _find(config: "PI05GeometryConfig", root: Path) -> Path:
+def _find(config: "PI05GeometryConfig", root: Path, episodes: Episodes) -> Path:
     """The one store beside the dataset that fits."""
     beside = root / STORES
     found = stores_in(beside)
@@ -99,7 +99,7 @@ def _find(config: "PI05GeometryConfig", root: Path) -> Path:
             f"geometry_source=features needs a feature store, and {beside} has none{older}; run pi05-geometry precompute "
             f"--dataset.root={root}, or name one by --policy.features_path."
         )
-    reasons = {folder: misfit(config, manifest, root) for folder, manifest in found.items()}
+    reasons = {folder: misfit(config, manifest, root, episodes) for folder, manifest in found.items()}
     fitting = [folder for folder, reason in reasons.items() if reason is None]
     if not fitting:
         told = "; and ".join(f"{folder.name}: {reason}" for folder, reason in reasons.items())
