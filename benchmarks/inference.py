@@ -9,7 +9,8 @@ All arms run the same weights and observations in one process, in turn, round by
 median over rounds of an arm's time over eager LeRobot's in the same round. Ours is what a policy uses by default (the runner; on
 a GPU as CUDA graphs, with an arm without them beside it), with geometry features given: what measures depth is not in it. `--da3`
 adds two arms that also measure: Depth Anything 3 with random weights on the same cameras, beside vision and prefix, and before
-them. Ours pads the prompt (`--prompt` tokens) to what it needs, on a GPU to the next multiple of 32; LeRobot's always to 200. The
+them. `--rtc` adds two arms of the runner that continue a previous chunk, guided and trained. Ours pads the prompt (`--prompt`
+tokens) to what it needs, on a GPU to the next multiple of 32; LeRobot's always to 200. The
 floor is what this machine's own matrix products and memory would need for our network's products alone, measured in the same run.
 `far` is the distance of the runner's actions from the plain path's, over the size of those. Memory is the peak of live tensors in
 the first chunk; on a CPU the compiled arms cannot be watched.
@@ -26,6 +27,8 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from torch import Tensor
 
 from benchmarks.memory import peak_memory
@@ -40,14 +43,18 @@ from lerobot_policy_pi05_geometry.inference.runner import ChunkFunctions, ChunkR
 from lerobot_policy_pi05_geometry.inference.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.inference.side_stream import PendingGeometry
 from lerobot_policy_pi05_geometry.model import PI05Pytorch
+from lerobot_policy_pi05_geometry.model.config import RtcMode
 from lerobot_policy_pi05_geometry.model.segments import GeometryTokens
 
 EAGER, COMPILED, GEOMETRY, PLAIN = "lerobot", "lerobot compiled", "geometry", "no geometry"
 NO_GRAPHS, OWN_COMPILED, BESIDE, BEFORE = "geometry, no graphs", "geometry, compiled", "da3 beside", "da3 before"
+GUIDED, TRAINED = "rtc guided", "rtc trained"
 PAIRS = {
     "beside over before": (BESIDE, BEFORE),
     "graphs over none": (GEOMETRY, NO_GRAPHS),
     "compiled over not": (OWN_COMPILED, GEOMETRY),
+    "rtc guided over none": (GUIDED, GEOMETRY),
+    "rtc trained over none": (TRAINED, GEOMETRY),
 }
 
 
@@ -114,6 +121,19 @@ def da3(args: argparse.Namespace, observation: Observation, ours: PI05Pytorch) -
     return PendingGeometry(source.num_tokens, partial(encoder, batch))
 
 
+RTC_ARMS: dict[str, RtcMode] = {GUIDED: "guided", TRAINED: "trained"}
+DELAY = 5  # action steps that are executed while a chunk is computed
+
+
+def continued_chunk(sample: Callable[..., Tensor], tokens: Tensor, ours: PI05Pytorch, mode: RtcMode) -> Tensor:
+    """A chunk of the runner that continues a random one, by real-time chunking."""
+    left_over = torch.ones(1, ours.config.chunk_size - DELAY, ours.config.max_action_dim, device=tokens.device)
+    ours.rtc_processor, ours.rtc_mode = RTCProcessor(RTCConfig()), mode
+    actions = sample(geom_embs=tokens, prev_chunk_left_over=left_over, inference_delay=DELAY)
+    ours.rtc_processor = None
+    return actions
+
+
 def chunk_functions(
     args: argparse.Namespace, cameras: int, sampler: ChunkSampler, ours: PI05Pytorch, lerobot
 ) -> dict[str, Callable[[], Tensor]]:
@@ -128,6 +148,8 @@ def chunk_functions(
         PLAIN: sample,
         EAGER: lambda: lerobot.sample_actions(*padded, noise=noise),
     }
+    if args.rtc:
+        functions |= {arm: partial(continued_chunk, sample, tokens, ours, mode) for arm, mode in RTC_ARMS.items()}
     if args.device != "cpu" and runner == "fast":
         functions[NO_GRAPHS] = lambda: sample(geom_embs=tokens, runner="eager")
     if args.da3:
@@ -321,6 +343,9 @@ def main() -> None:
     parser.add_argument("--geometry-tokens", type=int, default=64)
     parser.add_argument(
         "--da3", choices=sorted(VARIANTS), help="also measure geometry with Depth Anything 3 of this size"
+    )
+    parser.add_argument(
+        "--rtc", action="store_true", help="also chunks that continue the previous one (real-time chunking)"
     )
     parser.add_argument("--trace", type=Path, help="write a trace of each arm into this folder")
     parser.add_argument("--rounds", type=int, default=5)

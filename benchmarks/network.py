@@ -80,7 +80,7 @@ def build(arm: str, args: argparse.Namespace, weights: torch.nn.Module | None = 
         return network.eval()
     config = NetworkConfig(
         PALIGEMMA_VARIANTS[vlm], EXPERT_VARIANTS[expert], size, args.chunk, 32, dtype=dtype, param_dtype=dtype,
-        geometry=GeometrySegmentConfig(),
+        geometry=GeometrySegmentConfig(), rtc_training_max_delay=args.chunk - 1,
     )  # fmt: skip
     with default_dtype(dtype), uninitialised():
         network = PI05Pytorch(config)

@@ -49,9 +49,9 @@ def test_parts_give_the_policys_own_actions(changes):
 
 
 def test_advice_follows_from_the_measurement():
-    result = bench(load(n_action_steps=1, geometry_time="denoise"), make_observation(1), rounds=1)
+    result = bench(load(n_action_steps=1, inference_runner="plain"), make_observation(1), rounds=1)
     assert result.parts == {}
-    assert "The runner is off (declined: geometry_time=denoise" in result.advice[0]
+    assert "The runner is off (declined: inference_runner=plain" in result.advice[0]
     assert "Only 1 of 6 predicted actions" in result.advice[-1]
     assert not any("float32" in sentence for sentence in result.advice)  # of the released size alone
 

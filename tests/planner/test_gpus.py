@@ -23,7 +23,7 @@ def test_numbers(gigabytes):
 
 @pytest.mark.parametrize("wrong", ["", "gtx970x", "0", "-3", "nan", "1e9"])
 def test_other_names(wrong):
-    with pytest.raises(ValueError, match="is no GPU the planner knows"):
+    with pytest.raises(ValueError, match="is not a GPU that the planner knows"):
         gpu_bytes(wrong)
 
 

@@ -11,8 +11,9 @@
    segment_cache        keys and values kept between denoising steps       vision    SigLIP, all cameras in one batch
    segment_gate         a learned weight of geometry in the actions' attention
    paligemma_with_expert    the loop over segments, layer by layer         pi05      embed, train, sample
-   flow_matching        noise and flow times that a resumed run draws again
-   config, variants     what the network has to be told; named sizes       precision what stays in float32, and why
+   flow_matching        noise and flow times, keyed for resumed runs       norms     plain and adaptive, and the residual
+   real_time_chunking   inputs of guided and trained RTC                   precision storage and compute dtypes
+   config, variants     settings of the network; named sizes
 ```
 """
 

@@ -18,12 +18,12 @@ _MASK = (1 << 64) - 1
 
 
 class FlowDraw(NamedTuple):
-    """What is random about a training batch, on the CPU."""
+    """The random numbers of a training batch, on the CPU."""
 
     noise: Tensor  # (B, S, D) float32, standard normal; (B, K, S, D) for K > 1 flow samples
     time: Tensor  # (B,) float32 in (0, 1]; (B, K)
-    dropout: Tensor  # (B,) float32, uniform in [0, 1): what the sample goes without (dropout.py)
-    camera: Tensor  # (B,) float32, uniform in [0, 1): which camera, if it goes without one
+    dropout: Tensor  # (B,) float32, uniform in [0, 1): which inputs are masked (training/dropout.py)
+    camera: Tensor  # (B,) float32, uniform in [0, 1): which camera, if one camera is masked
     delay: Tensor  # (B,) int64 in [0, max_delay]: action steps of the hard prefix (real_time_chunking.py)
 
 

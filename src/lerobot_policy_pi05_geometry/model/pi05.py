@@ -49,7 +49,7 @@ class PI05Pytorch(nn.Module):
 
     @property
     def geometry_in_prefix(self) -> bool:
-        """Whether geometry stands among the VLM's own tokens, and not in a segment of its own."""
+        """Whether geometry stands in the VLM's own prefix, and not in a segment of its own."""
         return self.config.geometry is not None and self.config.geometry.placement == "prefix"
 
     def gradient_checkpointing_enable(self) -> None:
@@ -73,7 +73,7 @@ class PI05Pytorch(nn.Module):
         embs, pads = [], []
         present = [(image, mask) for image, mask in zip(images, img_masks, strict=True) if image is not None]
         if present:
-            # What a masked image holds must not reach a gradient either: 0 x NaN is NaN in the backward pass.
+            # The values of a masked image must not reach a gradient either: 0 x NaN is NaN in the backward pass.
             shown = [image.masked_fill(~mask[:, None, None, None], 0.0) for image, mask in present]
             patches = network.embed_image(torch.cat(shown))  # (V * B, patches, W_vlm)
             embs = list(patches.chunk(len(present)))

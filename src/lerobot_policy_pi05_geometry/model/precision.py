@@ -1,13 +1,13 @@
 """The dtype policy, in one place.
 
 `param_dtype` is how weights are stored, `dtype` what matrix products compute in. Two kinds of module stay in float32
-whatever these say, because bfloat16 (8 bits of mantissa) would lose what they are for:
+whatever these say, because bfloat16 has too few digits (8 bits of mantissa) for them:
 
 * `Float32Linear` and the geometry gate: they are trained with small updates, and an update below 1/256 of a weight
   vanishes in a bf16 weight. These are the geometry adapter, the gate, the action projections (their output is
   integrated over ten flow steps) and the flow-time MLP (its input has periods down to 0.004).
 * Norms: mean and scale are taken in float32 and their weights stored in float32 (a scale of 1 + w loses w below 1/256),
-  SigLIP's LayerNorms and the linear map of the adaptive norm included, through which alone the flow time acts.
+  SigLIP's LayerNorms and the linear map of the adaptive norm included, since the flow time acts through it alone.
 
 bf16 compute over float32 storage is autocast; a float32 module switches autocast off around itself, since a float32
 Linear under autocast returns bf16.

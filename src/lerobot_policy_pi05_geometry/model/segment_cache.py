@@ -44,7 +44,7 @@ class SegmentKVCache:
         self.values = torch.zeros(shape, dtype=dtype, device=device)
 
     def slot(self, layer: int, segment: Segment) -> "CacheSlot":
-        """The place of one segment in one layer."""
+        """The slot of one segment in one layer."""
         span = self._spans[segment]
         return CacheSlot(
             self.keys[layer, :, :, span],
@@ -59,7 +59,7 @@ class SegmentKVCache:
 
 
 class CacheSlot:
-    """Where one segment of one layer writes, and what it then sees."""
+    """The part of the cache that one segment of one layer writes, and the part that it then sees."""
 
     def __init__(self, keys: Tensor, values: Tensor, seen_keys: Tensor, seen_values: Tensor) -> None:
         self._keys, self._values = keys, values

@@ -7,7 +7,7 @@ begins as the one it came from.
 The openness itself is the parameter, and not its logarithm: the gradient of a logarithm shrinks with the openness, and a
 log-gate that started at -16 was still shut after 1,500 steps of fine-tuning (docs/results.md). The magnitude is what counts, so
 a step past zero opens the gate again. Below 1e-8 the logarithm stays where it is and the gradient is passed through: log 0
-would make it NaN, and a gradient of 0 would never let go of the parameter.
+would make it NaN, and with a gradient of 0 the parameter would stay there.
 """
 
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from .precision import Float32Module
 
-SMALLEST = 1e-8  # openness that the logarithm sees at least
+SMALLEST = 1e-8  # smallest openness that the logarithm is taken of
 
 
 class GeometryGate(Float32Module):

@@ -34,9 +34,9 @@ from .segments import AttMasks, Segment
 
 
 def make_att_mask(pad_masks: Tensor, att_masks: AttMasks) -> Tensor:
-    """Square attention mask of a whole sequence, the reference that the rectangles are cut from.
+    """Square attention mask of a whole sequence, the reference for the rectangles.
 
-    pad_masks: (B, N) bool, True for real tokens. att_masks: N entries, see the module's text.
+    pad_masks: (B, N) bool, True for real tokens. att_masks: N entries, see the module's docstring.
     Returns (B, N, N) bool, [b, query, key]. Source: openpi `make_attn_mask`, but masking keys only.
     """
     block = torch.tensor(list(accumulate(att_masks)), device=pad_masks.device)  # (N,)
@@ -50,7 +50,7 @@ def segment_mask(
     """Attention mask of one segment's queries against the keys of all segments up to its own.
 
     pads, atts: per segment, (B, N_i) bool and N_i entries; None for an absent segment.
-    samples: flow samples that stand side by side in the segment, blind to each other (training's suffix only).
+    samples: flow samples that stand side by side in the segment and do not attend to each other (the suffix in training).
     Returns (B, 1, K) bool where every query of the segment sees the same keys, else (B, Q, K).
     """
     present = [s for s in Segment if s <= segment and pads[s] is not None]

@@ -56,7 +56,7 @@ def one_block(length: int) -> list[int]:
 
 
 class GeometryTokens(NamedTuple):
-    """What geometry hands to the network: tokens (B, G, W) and their validity (B, G) bool, False for a hole."""
+    """Geometry as the network takes it: tokens (B, G, W) and their validity (B, G) bool, False for a hole."""
 
     embs: Tensor
     pad: Tensor

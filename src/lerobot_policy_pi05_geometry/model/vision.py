@@ -1,4 +1,4 @@
-"""SigLIP and the projector into the VLM: a library's vision tower, all cameras in one batch."""
+"""SigLIP (from transformers) and the projector into the VLM; all cameras in one batch."""
 
 import torch
 from torch import Tensor, nn

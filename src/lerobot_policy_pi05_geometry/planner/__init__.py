@@ -2,13 +2,13 @@
 
 ```
    options         the user's --policy.* and --peft.* options -> a configuration
-   configuration   features and calibration where no dataset is there to give them
-   workload        a policy on fake tensors, one training step or one action chunk of it
-   planned         the policy without what needs values        acting     its sampling of chunks, likewise
-   counting        bytes that live at once, by purpose         adapters   LoRA by PEFT
+   configuration   features and calibration, where no dataset gives them
+   workload        one training step or one action chunk of a policy on fake tensors
+   planned         the policy without the parts that need values   acting     its sampling of chunks
+   counting        bytes that live at once, by purpose             adapters   LoRA by PEFT
    optimisers      bytes per parameter, by the optimiser's name
-   gpus            named cards, and the margins assumed
+   gpus            memory of named GPUs, and assumed margins
    proposals       recipes that fit a GPU, best first
-   tables          what the command prints
+   tables          the printed tables
 ```
 """

@@ -1,13 +1,13 @@
-"""LoRA over a planned policy: PEFT's own layers, laid as lerobot-train lays them."""
+"""LoRA in a planned policy: PEFT's own layers, added as lerobot-train adds them."""
 
 import importlib.util
 
 from lerobot.policies.pretrained import PreTrainedPolicy
 
-SOMEWHERE = "CHECKPOINT"  # LoRA wants to know where it starts from; nothing is read there
+SOMEWHERE = "CHECKPOINT"  # LeRobot refuses LoRA without a pretrained path; nothing is read from it
 
 
-def why_not() -> str | None:
+def unsupported_reason() -> str | None:
     """Why LoRA cannot be planned, as the rest of a sentence; None if it can."""
     if importlib.util.find_spec("peft") is None:
         return "it needs PEFT, which is not installed: `pip install 'lerobot_policy_pi05_geometry[lora]'`"
@@ -15,11 +15,11 @@ def why_not() -> str | None:
 
 
 def add_lora(policy: PreTrainedPolicy, rank: int) -> None:
-    """Freeze what `--peft.r=rank` freezes and lay adapters over `config.lora_targets`, on the spot.
+    """Freeze what `--peft.r=rank` freezes and add adapters to `config.lora_targets`, in place.
 
     Raises ValueError without PEFT.
     """
-    reason = why_not()
+    reason = unsupported_reason()
     if reason is not None:
         raise ValueError(f"LoRA cannot be planned: {reason}.")
     known = policy.config.pretrained_path

@@ -1,4 +1,4 @@
-"""`pi05-geometry plan`: from options to what is printed."""
+"""`pi05-geometry plan`: from options to tables."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from .workload import FakePolicy, Load
 
 @dataclass(frozen=True)
 class Data:
-    """What observations are like, where no checkpoint says it. image_size: (height, width)."""
+    """Observations, where no checkpoint describes them. image_size: (height, width)."""
 
     cameras: int = 2
     depth_cameras: int = 1
@@ -29,7 +29,7 @@ class Data:
 
 @dataclass(frozen=True)
 class Wish:
-    """What the user asks beside the policy's settings; see the command's help."""
+    """Arguments beside the policy's settings; see the command's help."""
 
     gpu: str | None = None
     batch_size: int = 8
@@ -38,9 +38,9 @@ class Wish:
 
 
 def run(arguments: Sequence[str], data: Data, wish: Wish) -> Iterator[RenderableType]:
-    """What to print, piece by piece. arguments: `--policy.*` and `--peft.*`, as lerobot-train takes them.
+    """The tables and lines to print, one by one. arguments: `--policy.*` and `--peft.*`, as lerobot-train takes them.
 
-    Raises ValueError, with one sentence, for what cannot be read, and where nothing fits.
+    Raises ValueError, with one sentence, for arguments that cannot be read, and where nothing fits.
     """
     rank, others = lora_rank(arguments)
     options = policy_options(others)
@@ -51,8 +51,8 @@ def run(arguments: Sequence[str], data: Data, wish: Wish) -> Iterator[Renderable
 
     config = make_config({})
     budget = None if wish.gpu is None else gpu_bytes(wish.gpu)
-    looks = config.geometry_source in ("da3", "features")
-    da3 = da3_variant(config.da3_encoder or DEFAULT_ENCODER) if looks else None
+    has_encoder = config.geometry_source in ("da3", "features")
+    da3 = da3_variant(config.da3_encoder or DEFAULT_ENCODER) if has_encoder else None
     prompt = data.prompt_tokens or config.tokenizer_max_length
     load = Load(wish.batch_size, config.micro_batch_size, prompt, config.optimizer)
     if budget is None:
@@ -69,7 +69,7 @@ def run(arguments: Sequence[str], data: Data, wish: Wish) -> Iterator[Renderable
 def _proposals(
     make_config: Any, load: Load, budget: int, fixed: Fixed, da3: Any, wish: Wish, options: Mapping[str, str]
 ) -> Iterator[RenderableType]:
-    """The table, the commands, and with `explain` what did not fit."""
+    """The table, the commands, and with `explain` the recipes that do not fit."""
     found: list[Proposal] = []
     rejected: list[Rejection] = []
     for outcome in propose(make_config, load, budget, fixed, da3):
@@ -83,13 +83,13 @@ def _proposals(
         why = (
             f"{rejected[-1].recipe.name}: {rejected[-1].why}"
             if rejected
-            else "the settings given leave no recipe to try"
+            else "no recipe agrees with the given settings"
         )
         raise ValueError(f"Nothing fits {budget / GIB:.1f} GiB ({why}); give a larger GPU, or fix fewer settings.")
     yield proposal_table(found, budget)
     for number, proposal in enumerate(found, 1):
         start = "--policy.type=pi05_geometry"
-        if "path" in options or proposal.recipe.lora:  # LoRA corrects weights that are there
+        if "path" in options or proposal.recipe.lora:  # LoRA needs pretrained weights
             start = f"--policy.path={options.get('path', SOMEWHERE)}"
         yield escape(f"{number}. lerobot-train {start} {' '.join(proposal.options())} ...")
     if wish.explain:

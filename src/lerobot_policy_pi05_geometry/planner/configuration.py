@@ -1,4 +1,4 @@
-"""A configuration as complete as a policy needs it, where no dataset is there to complete it."""
+"""Completes a configuration as a dataset would."""
 
 from dataclasses import replace
 
@@ -47,5 +47,5 @@ def complete(
 
 
 def acting(config: PI05GeometryConfig) -> PI05GeometryConfig:
-    """The configuration of a policy at inference: one that was trained on stored features looks live."""
+    """The configuration of a policy at inference: one that was trained on stored features runs the encoder itself."""
     return replace(config, geometry_source="da3") if config.geometry_source == "features" else config

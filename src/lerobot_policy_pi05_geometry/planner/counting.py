@@ -1,4 +1,4 @@
-"""Counts the bytes of storages that live while code runs, by what they are for, and remembers the largest moment.
+"""Counts the bytes of storages that live while code runs, by purpose, and records the peak.
 
 Run under PyTorch's `FakeTensorMode` it sees the very operations that a real run makes, of the very shapes and dtypes,
 while nothing is allocated. `torch.distributed._tools.MemTracker` counts the same (a test compares the two), but it rounds as
@@ -23,7 +23,7 @@ CUDA_BLOCK = 512  # bytes: PyTorch's CUDA allocator hands out multiples of it (k
 
 @dataclass(frozen=True)
 class MemorySplit:
-    """Bytes at one moment, by purpose. "activations" is all that has no other name: inputs, intermediates, workspaces."""
+    """Bytes at one moment, by purpose. "activations" are all without another purpose: inputs, intermediates, workspaces."""
 
     weights: int = 0
     gradients: int = 0
@@ -38,7 +38,7 @@ class MemorySplit:
 
 
 class MemoryCounter(TorchDispatchMode):
-    """While active, every new storage is an activation until `label` gives it another purpose, or `naming` has one for it.
+    """While active, it counts every new storage as an activation, unless `naming` or `label` gives it another purpose.
 
     block: bytes that a storage is rounded up to; 1 for none.
     """
@@ -55,12 +55,12 @@ class MemoryCounter(TorchDispatchMode):
 
     @property
     def spare(self) -> int:
-        """Bytes that were in use at the largest moment and are not now."""
+        """Bytes that were in use at the peak and are not now."""
         return self._highest - self._total
 
     @contextmanager
     def naming(self, purpose: Purpose) -> Iterator[None]:
-        """New storages have this purpose meanwhile."""
+        """New storages have this purpose inside the context."""
         before, self._purpose = self._purpose, purpose
         try:
             yield
@@ -68,7 +68,7 @@ class MemoryCounter(TorchDispatchMode):
             self._purpose = before
 
     def label(self, tensors: Iterable[Tensor], purpose: Purpose) -> None:
-        """Say what these tensors' storages are for, whether or not they have been seen before."""
+        """Give the storages of these tensors a purpose, whether or not they have been counted before."""
         for tensor in tensors:
             key = self._track(tensor)
             reference, before, size = self._live[key]
@@ -90,7 +90,7 @@ class MemoryCounter(TorchDispatchMode):
         key = storage._cdata
         if key not in self._live:
             size = -(-storage.nbytes() // self.block) * self.block
-            # PyTorch keeps a storage's Python object as long as the storage itself, so this tells when it is freed.
+            # PyTorch keeps a storage's Python object as long as the storage itself, so this is called when the storage is freed.
             self._live[key] = (weakref.ref(storage, lambda _: self._forget(key)), self._purpose, size)
             self._now[self._purpose] += size
             self._total += size

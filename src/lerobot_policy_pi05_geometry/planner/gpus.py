@@ -1,10 +1,10 @@
-"""How much memory a GPU has, by name or number, and how much of it a prediction has to leave alone."""
+"""How much memory a GPU has, by name or number, and the margins that a prediction leaves free."""
 
 from .counting import MemorySplit
 
 GIB = 2**30
 
-# MiB, as nvidia-smi reports them with the driver's and ECC's share taken off where there is one.
+# MiB, as nvidia-smi reports them, without the share of the driver and of ECC.
 GPUS = {
     "rtx3090": 24_576,
     "rtx4090": 24_564,
@@ -21,8 +21,8 @@ GPUS = {
     "b200": 183_359,
 }
 
-# Assumed, not measured here: what CUDA, cuBLAS and cuDNN take of the device outside of PyTorch's allocator (context and kernels)
-# and inside of it (workspaces, 32 MiB on Hopper); and what is lost between blocks that do not fit each other.
+# Assumed, not measured here: the memory of CUDA, cuBLAS and cuDNN outside of PyTorch's allocator (context and kernels) and inside
+# of it (workspaces, 32 MiB on Hopper), and the memory lost to fragmentation.
 CONTEXT = int(0.75 * GIB)
 FRAGMENTATION = 0.05  # of the predicted peak
 
@@ -39,7 +39,7 @@ def gpu_bytes(gpu: str) -> int:
         number = 0.0
     if not 0 < number < 10_000:
         raise ValueError(
-            f"'{gpu}' is no GPU the planner knows; give its memory in GB (--gpu 24), or {', '.join(GPUS)}."
+            f"'{gpu}' is not a GPU that the planner knows; give its memory in GB (--gpu 24), or {', '.join(GPUS)}."
         )
     return int(number * GIB)
 

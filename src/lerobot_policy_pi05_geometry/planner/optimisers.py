@@ -1,4 +1,4 @@
-"""What an optimiser keeps per parameter, and what a step needs on top of that, by its name in the policy's configuration."""
+"""Memory of an optimiser, by its name in the policy's configuration: its state per parameter, and the workspace of a step."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,8 +12,8 @@ from ..training.parameter_groups import FULL_STATE
 # and a table of 256 numbers each.
 EIGHT_BIT_FROM = 4096
 EIGHT_BIT_BLOCK = 256
-# What torchao's step holds for one quantised parameter, in float32 copies of it, by PyTorch's CPU allocator: without a compiler
-# (as on a CPU here), and compiled (as on a GPU, where it has not been measured).
+# Workspace of torchao's step for one quantised parameter, in float32 copies of it, measured with PyTorch's CPU allocator: without
+# a compiler (as on a CPU), and compiled (as on a GPU, where it has not been measured).
 EAGER_COPIES, COMPILED_COPIES = 13.26, 2.01
 
 
@@ -34,11 +34,11 @@ def state_bytes(optimizer: str, parameter: Tensor, full: bool = False) -> list[i
 def step_bytes(
     optimizer: str, groups: Sequence[Mapping[str, Any]], block: int = 1, foreach: bool = True
 ) -> tuple[int, int]:
-    """Bytes of all state, and of what a step needs beside it, for parameter groups as an optimiser takes them.
+    """Bytes of all state, and of the workspace of a step, for parameter groups as an optimiser takes them.
 
-    foreach: as on CUDA. There PyTorch's AdamW updates all tensors of one group at once, and holds the square roots of all
-    their second moments meanwhile, once the parameters' size again; one by one (on a CPU), twice the largest parameter.
-    block: what the allocator rounds up to.
+    foreach: as on CUDA. There PyTorch's AdamW updates all tensors of one group at once and holds the square roots of all their
+    second moments, as much as the parameters. On a CPU it updates one by one, and holds twice the largest parameter.
+    block: bytes that the allocator rounds up to.
     """
     states, workspace = 0, 0
     for group in groups:

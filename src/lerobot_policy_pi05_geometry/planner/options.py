@@ -37,18 +37,18 @@ def lora_rank(arguments: Sequence[str]) -> tuple[int | None, list[str]]:
 
 
 def policy_options(arguments: Sequence[str]) -> dict[str, str]:
-    """`--policy.name=value` as name and text. Raises ValueError for anything else, and for names that there are not."""
+    """`--policy.name=value` as name and text. Raises ValueError for anything else, and for unknown names."""
     known = {entry.name for entry in fields(PI05GeometryConfig)} | {"path", "type"}
     options = {}
     for argument in arguments:
         name, separator, value = argument.removeprefix(_PREFIX).partition("=")
         if not argument.startswith(_PREFIX) or not separator:
             raise ValueError(
-                f"'{argument}' is no option of this command; the policy's settings are {_PREFIX}name=value; see --help."
+                f"'{argument}' is not an option of this command; the policy's settings are {_PREFIX}name=value; see --help."
             )
         if name not in known:
             raise ValueError(
-                f"{_PREFIX}{name} is no setting of this policy; see its configuration for those there are."
+                f"{_PREFIX}{name} is not a setting of this policy; see `PI05GeometryConfig` for all settings."
             )
         options[name] = value
     return options
@@ -72,7 +72,7 @@ def configuration(options: Mapping[str, str]) -> PI05GeometryConfig:
         return draccus.parse(PI05GeometryConfig, args=arguments)
     except draccus.utils.DecodingError as error:
         raise ValueError(f"A setting of the policy cannot be read: {error}.") from error
-    except draccus.ParsingError as error:  # of a configuration that refuses its settings: its own sentence
+    except draccus.ParsingError as error:  # the configuration's own sentence
         raise ValueError(str(error.__cause__ or error)) from error
 
 
@@ -82,7 +82,7 @@ def typed(options: Mapping[str, str], config: PI05GeometryConfig) -> dict[str, A
 
 
 def da3_variant(encoder: str) -> Da3Variant:
-    """The size of an encoder: read from its file, or told by its released name. Raises ValueError for an unknown name."""
+    """The size of an encoder: read from its file, or known by its released name. Raises ValueError for an unknown name."""
     path = Path(encoder)
     if path.exists():
         return read_variant(path if path.is_file() else path / "model.safetensors")

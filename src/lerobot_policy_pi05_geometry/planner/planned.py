@@ -1,6 +1,7 @@
 """The policy as the planner runs it: LeRobot's batches without values, so nothing may read one."""
 
 from collections.abc import Mapping, Set
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -52,13 +53,14 @@ class PlannedPolicy(PI05GeometryPolicy):
     """The real policy, but for what needs values: drawing noise, checking measurements, reading a feature store."""
 
     def __init__(self, config: PI05GeometryConfig, encoder: Da3Encoder | None) -> None:
-        super().__init__(config, encoder=encoder)
+        stored = config.geometry_source == "features"  # the encoder has the same cameras, cells and width
+        super().__init__(replace(config, geometry_source="da3") if stored else config, encoder=encoder)
         self.image_range = PlannedImages()
         self.config.use_relative_actions = False  # planned batches are made without processors; no memory depends on it
         if self.geometry is None:
             return
         source = self.geometry.source
-        if config.geometry_source == "features":
+        if stored:
             assert encoder is not None
             cameras, optional = tuple(config.rgb_cameras()), config.optional_rgb_cameras()
             source = StoredFeatures(cameras, config.geometry_grid, encoder.variant.feature_dim, optional)

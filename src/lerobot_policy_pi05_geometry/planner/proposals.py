@@ -1,7 +1,8 @@
-"""Settings that fit a GPU, best first: as close to full fine-tuning as it goes, then as many samples at once as it goes.
+"""Settings that fit a GPU, best first: as close to full fine-tuning as possible, then as many samples at once as possible.
 
-What the user has fixed stays fixed. Of the rest a recipe says what is trained and how; for each the largest (micro-)batch that
-fits is looked for, a power of two below the wanted batch. Gradient checkpointing is given up where the wanted batch fits without.
+The settings that the user gave stay as they are. A recipe says what is trained, and how. For each recipe the largest
+(micro-)batch that fits is searched: the requested batch, or a power of two below it. Gradient checkpointing is off where the
+requested batch fits without it.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -9,12 +10,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ..configuration_pi05_geometry import PI05GeometryConfig
-from .adapters import why_not
+from .adapters import unsupported_reason
 from .counting import MemorySplit
 from .gpus import GIB, needed
 from .workload import FakePolicy, Load
 
-RANK = 16  # of LoRA, where the user has given none; lerobot-train's default
+RANK = 16  # of LoRA, unless the user gives one; lerobot-train's default
 
 
 @dataclass(frozen=True)
@@ -29,11 +30,11 @@ class Recipe:
         return {**_PLAIN, **self.settings}
 
     def without_optimizer(self) -> tuple[Any, ...]:
-        """What tells recipes apart whose passes forward and backward are the same."""
+        """The settings that the forward and backward pass depend on."""
         return (*sorted((k, v) for k, v in self.all_settings().items() if k != "optimizer"), self.lora)
 
 
-# float32 weights, bfloat16 products. Weights that LoRA leaves frozen lose nothing in bfloat16, which is what they are used in.
+# float32 weights, bfloat16 products. The weights that LoRA freezes lose nothing in bfloat16, since products use them in it.
 _PLAIN = {
     "dtype": "bfloat16", "param_dtype": "float32", "train_expert_only": False, "freeze_vision_encoder": False,
     "optimizer": "adamw",
@@ -57,7 +58,7 @@ RECIPES = (
 
 @dataclass(frozen=True)
 class Fixed:
-    """What the user has fixed: settings of the policy by name, and the rank of LoRA, None where LoRA is open."""
+    """What the user gave: settings of the policy by name, and the rank of LoRA, None if LoRA was not asked for."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     lora_rank: int | None = None
@@ -71,21 +72,21 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A recipe that fits, with what it needs. fixed: what the user had fixed. unsaid: settings there are without any option."""
+    """A recipe that fits, and the memory it needs. fixed: what the user gave. defaults: the settings without any option."""
 
     recipe: Recipe
     checkpointing: bool
     load: Load
     split: MemorySplit
     fixed: Fixed = Fixed()
-    unsaid: Mapping[str, Any] = field(default_factory=dict)
+    defaults: Mapping[str, Any] = field(default_factory=dict)
 
     def options(self) -> list[str]:
-        """What to give to lerobot-train for it: what the user gave, and what a checkpoint or the defaults have otherwise."""
+        """The options of lerobot-train for it: those given by the user, and those that differ from checkpoint or defaults."""
         rows, whole, given = self.load.rows, self.load.batch_size, self.fixed.settings
         wanted = self.recipe.all_settings() | {"gradient_checkpointing": self.checkpointing} | dict(given)
         wanted["micro_batch_size"] = rows if rows < whole else 0
-        said = {name: value for name, value in wanted.items() if name in given or value != self.unsaid.get(name)}
+        said = {name: value for name, value in wanted.items() if name in given or value != self.defaults.get(name)}
         written = [f"--policy.{name}={str(value).lower()}" for name, value in said.items()]
         peft = [f"--peft.r={self.fixed.lora_rank or RANK}"] if self.recipe.lora else []
         return [*written, *peft, f"--batch_size={whole}"]
@@ -93,7 +94,7 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Rejection:
-    """A recipe that is not proposed, and why, as the rest of a sentence; unavailable: whatever the GPU."""
+    """A recipe that is not proposed, and why, as the rest of a sentence. unavailable: on any GPU."""
 
     recipe: Recipe
     why: str
@@ -109,16 +110,16 @@ def propose(
 ) -> Iterator[Proposal | Rejection]:
     """Every recipe in turn, best first, as a proposal or a rejection.
 
-    make_config: settings -> a complete configuration. load: the wanted batch. budget: bytes of the GPU.
+    make_config: settings -> a complete configuration. load: the requested batch. budget: bytes of the GPU.
     """
     built: dict[Any, FakePolicy] = {}
     plain = make_config({})
-    unsaid = vars(plain) | {"micro_batch_size": plain.micro_batch_size or 0}
-    at_ease: set[Any] = set()  # what fits with the whole batch at once
+    defaults = vars(plain) | {"micro_batch_size": plain.micro_batch_size or 0}
+    fit_whole: set[Any] = set()  # recipes that fit with the whole batch at once
     for recipe in RECIPES:
-        if not fixed.allows(recipe) or recipe.without_optimizer() in at_ease:  # at ease, 8 bits would gain nothing
+        if not fixed.allows(recipe) or recipe.without_optimizer() in fit_whole:  # then 8 bits would gain nothing
             continue
-        reason = why_not() if recipe.lora else None
+        reason = unsupported_reason() if recipe.lora else None
         if reason is not None:
             yield Rejection(recipe, reason, unavailable=True)
             continue
@@ -131,13 +132,13 @@ def propose(
                 built[key] = FakePolicy(make_config(settings | dict(fixed.settings)), rank, da3)
             policy = built[key]
             asked = replace(load, micro_batch_size=rows, optimizer=recipe.all_settings()["optimizer"])
-            floor = policy.resident(asked)  # seconds are spared where this alone is too much
+            floor = policy.resident(asked)  # saves seconds where this alone is too much
             return asked, floor if needed(floor) > budget else policy.training(asked)
 
         outcome = _largest(recipe, predict, load, budget, fixed)
         if isinstance(outcome, Proposal) and outcome.load.rows == load.batch_size:
-            at_ease.add(recipe.without_optimizer())
-        yield replace(outcome, unsaid=unsaid) if isinstance(outcome, Proposal) else outcome
+            fit_whole.add(recipe.without_optimizer())
+        yield replace(outcome, defaults=defaults) if isinstance(outcome, Proposal) else outcome
 
 
 def _largest(
@@ -147,7 +148,7 @@ def _largest(
     budget: int,
     fixed: Fixed,
 ) -> Proposal | Rejection:
-    """The recipe with the largest micro-batch that fits; see the module's text for what is tried."""
+    """The recipe with the largest micro-batch that fits; see the module's docstring for the order."""
     checkpointing = fixed.settings.get("gradient_checkpointing")
     rows = wanted.rows
     while rows:
@@ -158,7 +159,7 @@ def _largest(
                 if needed(plain[1]) <= budget:
                     return Proposal(recipe, False, *plain, fixed)
             return Proposal(recipe, checkpointing is not False, asked, split, fixed)
-        # Activations grow with the batch in a straight line, and not from zero: this guess is rarely too small.
+        # Activations grow linearly with the batch, from an offset, so this guess is rarely too small.
         spare = budget - needed(replace(split, activations=0))
         if split.activations == 0 or (spare <= 0 and rows == 1) or fixed.settings.get("micro_batch_size"):
             break

@@ -1,4 +1,4 @@
-"""What `pi05-geometry plan` prints."""
+"""The tables that `pi05-geometry plan` prints."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -48,17 +48,17 @@ def proposal_table(proposals: Sequence[Proposal], budget: int) -> Table:
 
 
 def explanation(config: PI05GeometryConfig, load: Load) -> Text:
-    """What counts as what, and what was assumed."""
+    """The purposes, and the assumptions."""
     cameras = ", ".join(f"{f.shape[-2]} x {f.shape[-1]}" for f in config.image_features.values()) or "no camera"
     lines = (
         "[bold]How this was counted[/bold]",
         "The second training step, when the optimiser's state is there, and one action chunk were run on fake tensors, which "
         "have shapes and dtypes but no memory, and the bytes that live at once were added up. The peak is the larger of "
         "forward and backward pass, and optimiser's step.",
-        "[bold]activations[/bold] are all that has no other name: inputs, intermediates, weights cast to bfloat16, what AdamW "
-        "needs during its step. [bold]optimiser[/bold]: two moments per trained parameter, of one byte each with 8-bit AdamW. "
-        "[bold]cache[/bold]: an observation's keys and values. [bold]weights[/bold] at inference: what the runner keeps in the "
-        "compute dtype, too.",
+        "[bold]activations[/bold] are all other tensors: inputs, intermediates, weights cast to bfloat16, and the "
+        "workspace of AdamW's step. [bold]optimiser[/bold]: two moments per trained parameter, one byte each with 8-bit AdamW. "
+        "[bold]cache[/bold]: an observation's keys and values. [bold]weights[/bold] at inference include the runner's copies in "
+        "the compute dtype.",
         "[bold]What was assumed[/bold]",
         f"Images: {cameras}, float32 on the GPU as LeRobot's loader gives them. Prompts of {load.prompt_tokens} tokens.",
         "One GPU; DDP adds the gradients once more, for its buckets. AdamW's foreach variant, PyTorch's default on CUDA. "
@@ -66,6 +66,6 @@ def explanation(config: PI05GeometryConfig, load: Load) -> Text:
         "on a CPU. "
         "Attention by a fused kernel, which keeps no matrix of weights, but for the suffix while its gate is trained.",
         f"GPU needed is the peak, {FRAGMENTATION:.0%} of it for fragmentation, and {CONTEXT / GIB:.2f} GiB for CUDA's context "
-        "and workspaces. These two margins are assumptions; no GPU was at hand to measure them.",
+        "and workspaces. These two margins are assumptions; they were not measured on a GPU.",
     )
     return Text.from_markup("\n".join(lines))

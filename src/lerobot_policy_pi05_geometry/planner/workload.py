@@ -1,9 +1,9 @@
-"""A policy that takes no memory, and what it does in training and at inference, counted.
+"""Memory of a policy in training and at inference, counted without allocating it.
 
 The policy is built without weights, its parameters become fake tensors on the CPU, and the real network runs on them, forward
-and backward. Fakes on the CPU rather than on "cuda", so that every machine gives the same answer: PyTorch switches
-autocast off for a CUDA it does not find. Attention then counts as PyTorch's fused CPU kernel, which like CUDA's fused kernels
-keeps its output and one number per query. What CUDA's autocast does otherwise is in `CudaAutocast`.
+and backward. The fake tensors are on the CPU and not on "cuda", so that every machine gives the same answer: PyTorch switches
+autocast off where it finds no CUDA. Attention counts as PyTorch's fused CPU kernel, which like CUDA's fused kernels keeps its
+output and one number per query. `CudaAutocast` has the differences of CUDA's autocast.
 """
 
 from contextlib import ExitStack
@@ -34,7 +34,7 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Load:
-    """What is asked of the policy at once.
+    """The size of a training step or a prediction.
 
     batch_size: samples of a training step, or observations of a prediction. micro_batch_size: samples whose activations
     live at the same time, None or 0 for all. prompt_tokens: padded length of the prompts. optimizer: as in the policy's
@@ -54,7 +54,7 @@ class Load:
 
 
 class _Step(NamedTuple):
-    """Largest moment of a forward and backward pass, without the optimiser; bytes of all gradients, and of the batch."""
+    """Peak of a forward and backward pass, without the optimiser; bytes of all gradients, and of the batch."""
 
     largest: MemorySplit
     gradients: int
@@ -62,7 +62,7 @@ class _Step(NamedTuple):
 
 
 class CudaAutocast(TorchFunctionMode):
-    """Where CUDA's autocast differs from the CPU's for an operation of this network: layer norms return float32."""
+    """The difference between CUDA's autocast and the CPU's for this network: layer norms return float32."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is torch.nn.functional.layer_norm and torch.is_autocast_enabled("cpu"):
@@ -75,8 +75,8 @@ class FakePolicy:
     """A policy of this configuration on fake tensors, ready to be counted.
 
     config: features included; its calibration must be complete, as for a real policy. lora_rank: rank of LoRA on the
-    configuration's `lora_targets`, None for none. da3: the encoder's size, for geometry_source=da3 and features. With
-    features the policy can be trained; for inference, where it looks live, plan one with geometry_source=da3.
+    configuration's `lora_targets`, None for none. da3: the encoder's size, for geometry_source=da3 and features. A policy
+    with features can be planned in training; plan its inference with geometry_source=da3, since it runs the encoder then.
     """
 
     def __init__(self, config: PI05GeometryConfig, lora_rank: int | None = None, da3: Da3Variant | None = None) -> None:
@@ -101,7 +101,7 @@ class FakePolicy:
         with self.mode:
             self.policy.to_empty(device=CPU)
 
-    # --- what is exactly known ------------------------------------------------------------------------------------
+    # --- known exactly ----------------------------------------------------------------------------------------------
 
     def weights(self, block: int = 1) -> int:
         """Bytes of parameters and buffers."""
@@ -111,7 +111,7 @@ class FakePolicy:
         return [parameter for parameter in self.policy.parameters() if parameter.requires_grad]
 
     def resident(self, load: Load) -> MemorySplit:
-        """What is there at every optimiser step whatever the batch: weights, gradients and optimiser."""
+        """The memory of every optimiser step, whatever the batch: weights, gradients and optimiser."""
         block = _block(load.target)
         state, _ = self._optimiser(load)
         encoder = self._encoder()
@@ -123,8 +123,8 @@ class FakePolicy:
         )
 
     def _optimiser(self, load: Load) -> tuple[int, int]:
-        """Bytes of the optimiser's state, and of what its step needs."""
-        self.policy.config.optimizer = load.optimizer  # which says what parameter groups there are
+        """Bytes of the optimiser's state, and of the workspace of its step."""
+        self.policy.config.optimizer = load.optimizer  # which decides the parameter groups
         groups = self.policy.get_optim_params()
         return step_bytes(load.optimizer, groups, _block(load.target), foreach=load.target == "cuda")
 
@@ -132,14 +132,14 @@ class FakePolicy:
         source = None if self.policy.geometry is None else self.policy.geometry.source
         return source.encoder if isinstance(source, Da3Source) else None
 
-    # --- what has to be run ---------------------------------------------------------------------------------------
+    # --- found by running -------------------------------------------------------------------------------------------
 
     def training(self, load: Load) -> MemorySplit:
-        """The largest moment of a training step after the first, when the optimiser's state is there."""
+        """The peak of a training step after the first, when the optimiser's state exists."""
         state, workspace = self._optimiser(load)
         step = self._step(replace(load, optimizer="adamw"))
         new = [p for p in self.policy.new_parameters().values() if p.requires_grad]
-        # `update` keeps them, to measure how far they move.
+        # `update` keeps a copy of them, to measure their updates.
         before = sum(rounded(p.nbytes, _block(load.target)) for p in new)
         running = replace(step.largest, optimiser=state, activations=step.largest.activations + before)
         at_update = before + workspace + step.batch
@@ -147,7 +147,7 @@ class FakePolicy:
         return max(running, updating, key=lambda split: split.total)
 
     def _step(self, load: Load) -> _Step:
-        """Forward and backward pass, which do not depend on the optimiser; each load is run once."""
+        """Peak of the forward and backward pass, which do not depend on the optimiser; computed once per load."""
         load = replace(load, micro_batch_size=load.rows)
         if load in self._steps:
             return self._steps[load]
@@ -161,7 +161,7 @@ class FakePolicy:
             batch = self._batch(load.batch_size, load.prompt_tokens)
             if load.rows == load.batch_size:
                 loss = policy.loss(batch, load.batch_size)
-            else:  # the second micro-batch, which finds all gradients there, stands for all that follow
+            else:  # the second micro-batch stands for all later ones: all gradients exist when it begins
                 parts = [slice(0, load.rows), slice(load.rows, 2 * load.rows)]
                 given = [rows_of(batch, load.batch_size, part) for part in parts]
                 loss = sum_of([partial(policy.loss, part, load.batch_size) for part in given], trainable)
@@ -172,7 +172,9 @@ class FakePolicy:
                 hook.remove()
             for parameter in trainable:
                 parameter.grad = None
-        if load.rows < load.batch_size:  # the sums of gradients get their name when they are handed over, at the end
+        if (
+            load.rows < load.batch_size
+        ):  # the sums of gradients are labelled at the end, when the backward pass returns them
             missing = step.gradients - step.largest.gradients
             named = {"gradients": step.gradients, "activations": step.largest.activations - missing}
             step = step._replace(largest=replace(step.largest, **named))
@@ -180,7 +182,7 @@ class FakePolicy:
         return step
 
     def inference(self, load: Load) -> MemorySplit:
-        """The largest moment of predicting one action chunk. Two denoising steps stand for all."""
+        """The peak of predicting one action chunk. Two denoising steps stand for all."""
         policy = self.policy.eval()
         with ExitStack() as stack:
             counter = self._counter(stack, load.target)
@@ -191,7 +193,7 @@ class FakePolicy:
         return counter.peak
 
     def _counter(self, stack: ExitStack, target: Target) -> MemoryCounter:
-        """A counter at work over fake tensors, until the stack is left, with the weights already in it."""
+        """A counter of fake tensors that is active until the stack is closed and has counted the weights."""
         stack.enter_context(self.mode)
         if target == "cuda":
             stack.enter_context(CudaAutocast())
@@ -203,7 +205,7 @@ class FakePolicy:
         return stack.enter_context(counter)
 
     def _batch(self, size: int, prompt_tokens: int) -> dict[str, Tensor]:
-        """A batch as the preprocessor hands it to the policy: float images and depth in the data's own sizes."""
+        """A batch as the preprocessor gives it to the policy: float images and depth in the sizes of the data."""
         config = self.policy.config
         observed = {key: feature.shape for key, feature in config.image_features.items()}
         observed |= {key: feature.shape for key, feature in config.geometry_features.items()}
