@@ -23,7 +23,7 @@ def demo(
     output: Output = Path("demo"),
     workers: Workers = None,
 ) -> None:
-    """Record a simulated RGB-D task, train with and without geometry, evaluate both and a blind floor, write a report.
+    """Train a small π0.5, convert it, fine-tune it with geometry and without, move the camera, switch depth off, report.
 
     It runs on the CPU. Started again after an interruption, it continues. The report is report.html in the output folder.
     """
