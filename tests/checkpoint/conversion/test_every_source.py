@@ -10,7 +10,6 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 
 from lerobot_policy_pi05_geometry.checkpoint.conversion import GeometryStart, convert
-from lerobot_policy_pi05_geometry.checkpoint.conversion.geometry_start import SOURCES
 from lerobot_policy_pi05_geometry.checkpoint.conversion.settings import make_config
 from lerobot_policy_pi05_geometry.checkpoint.conversion.start import inherited_shapes, meta_policy, start_values
 from lerobot_policy_pi05_geometry.geometry.da3.weights import backbone_hash
@@ -27,6 +26,8 @@ from .sources import (
     noise_of,
     write_openpi,
 )
+
+SOURCES = ("none", "rgbd", "da3", "features", "random")
 
 
 @pytest.fixture(scope="session")
@@ -147,7 +148,7 @@ def test_the_data_names_the_cameras_that_depth_anything_looks_through(
 @pytest.mark.parametrize(
     ("start", "said"),
     [
-        (GeometryStart("depth"), "--geometry-source must be one of rgbd, da3, features, random, none, got 'depth'"),
+        (GeometryStart("depth"), "--geometry-source must be one of none, rgbd, da3, features, random"),
         (GeometryStart("rgbd", encoder="somewhere"), "--da3-encoder belongs to --geometry-source=da3 or features"),
         (GeometryStart("da3", encoder="/nowhere"), "The Depth Anything 3 encoder is not found"),
         (GeometryStart("random", calibration=Path("x")), "--calibration has no meaning"),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...configuration_pi05_geometry import DEFAULT_ENCODER, PI05GeometryConfig
+from ...configuration_pi05_geometry import CONTROLS, DEFAULT_ENCODER, SOURCES, PI05GeometryConfig
 from ...geometry import read_calibration_file
 from ...geometry.resolve import FROM_RGB
 
@@ -15,18 +15,17 @@ SHUT = 1e-7
 # A policy that acts from RGB takes geometry up only if the gate moves fast and images are missing often enough: neither alone
 # did (docs/results.md, "Warm start").
 TAKE_UP = {"geometry_lr": 3e-3, "geometry_gate_lr": 5e-2, "image_dropout": 0.4, "geometry_dropout": 0.2}
-SOURCES = ("rgbd", "da3", "features", "random", "rays", "none")
 
 
 @dataclass(frozen=True)
 class GeometryStart:
     """What `convert` was asked for. None: the default for a π0.5, and as it is for a checkpoint of this policy.
 
-    source: one of `SOURCES`, rgbd by default. cameras: names in token order; by default those of the source's configuration, or
-    one camera whose name the training data tells. calibration: a calibration file, or None if the training data has it.
-    grid, frame, expert: as in the configuration; an own expert starts as a copy of the action expert. openness: of the gate, see
-    `SHUT`. encoder: Depth Anything 3, for da3 and features: hub id, folder or safetensors file. tokens: what a depth cell's token
-    is computed from, statistics or points.
+    source: as in the configuration, rgbd by default. cameras: names in token order; by default those of the source's
+    configuration, or one camera whose name the training data tells. calibration: a calibration file, or None if the training
+    data has it. grid, frame, expert: as in the configuration; an own expert starts as a copy of the action expert. openness: of
+    the gate, see `SHUT`. encoder: Depth Anything 3, for da3 and features: hub id, folder or safetensors file. tokens: what a
+    depth cell's token is computed from, statistics or points.
     """
 
     source: str | None = None
@@ -41,8 +40,8 @@ class GeometryStart:
 
     def check(self, source: str) -> None:
         """Raise ValueError for options that do not belong together. source: the geometry source that results."""
-        if source not in SOURCES:
-            raise ValueError(f"--geometry-source must be one of {', '.join(SOURCES)}, got {source!r}.")
+        if source not in SOURCES + CONTROLS:
+            raise ValueError(f"--geometry-source must be one of {', '.join(SOURCES + CONTROLS)}, got {source!r}.")
         if self.encoder is not None and source not in ("da3", "features"):
             raise ValueError(
                 f"--da3-encoder belongs to --geometry-source=da3 or features, but this is {source}; leave it out."

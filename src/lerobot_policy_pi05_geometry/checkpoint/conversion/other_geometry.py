@@ -27,7 +27,7 @@ from torch import Tensor
 from ...configuration_pi05_geometry import DEFAULT_ENCODER, PI05GeometryConfig
 from ...geometry.adapter import PointAdapter
 from ...geometry.da3.weights import meta_da3
-from ...geometry.resolve import camera_names
+from ...geometry.resolve import FROM_RGB, camera_names
 from ...weight_files.strict_load import complain
 from .geometry_start import SHUT, TAKE_UP, GeometryStart
 from .settings import NOT_CARRIED, make_config
@@ -35,7 +35,7 @@ from .start import ADAPTER, GATE, OWN_EXPERT, STEP, inherited_shapes, is_new, me
 from .tensor_file import StoredTensor, check_weights, read_tensor
 
 Tensors = dict[str, StoredTensor | Tensor]
-_FROM_RGB = ("da3", "features")
+_DA3 = ("da3", "features")
 _LOG_GATE, _OPENNESS = f"{GATE}log_gate", f"{GATE}openness"
 _VIEW, _PLACES = f"{ADAPTER}view", (f"{ADAPTER}row", f"{ADAPTER}column")
 _KNOWN = {STEP, _LOG_GATE, _OPENNESS} | {ADAPTER + name for name in PointAdapter(4, 1, 1, 1).state_dict()}
@@ -121,7 +121,7 @@ def _plan(before: PI05GeometryConfig, start: GeometryStart, features_from_data: 
 
 
 def _choose_encoder(after: PI05GeometryConfig, start: GeometryStart) -> None:
-    if after.geometry_source not in _FROM_RGB:
+    if after.geometry_source not in _DA3:
         after.da3_encoder = after.da3_hash = after.da3_image_size = after.features_path = None
         return
     if start.encoder is not None:
@@ -144,7 +144,7 @@ def _choose_cameras(
         return
     names = list(start.cameras) if start.cameras is not None else before.geometry_cameras
     after.geometry_cameras = names
-    if source in _FROM_RGB:
+    if source in FROM_RGB:
         known = bool(_all_cameras(after, source))
     else:
         there = _all_cameras(before, "rgbd")
@@ -152,7 +152,7 @@ def _choose_cameras(
         calibrated = source == "random" or all(name in after.calibration for name in names)
         known = bool(names) and set(names) <= set(there) and calibrated
     if not known or features_from_data:
-        same_kind = source == "random" or (source in _FROM_RGB) == (before.geometry_source in _FROM_RGB)
+        same_kind = source == "random" or (source in FROM_RGB) == (before.geometry_source in FROM_RGB)
         names = after.geometry_cameras or (list(camera_names(before)) if same_kind else [])
         if source == "random" and names:
             after.geometry_cameras = names
@@ -163,12 +163,12 @@ def _all_cameras(config: PI05GeometryConfig, source: str) -> list[str]:
     """Every camera that a source of this kind could use, as far as the configuration knows them."""
     whole = deepcopy(config)
     whole.geometry_cameras = None
-    return list(whole.rgb_cameras() if source in _FROM_RGB else whole.depth_cameras())
+    return list(whole.rgb_cameras() if source in FROM_RGB else whole.depth_cameras())
 
 
 def _meaning(config: PI05GeometryConfig) -> tuple[str | None, ...]:
     """What decides what features mean, and so whether an adapter goes on reading them."""
-    if config.geometry_source in _FROM_RGB:
+    if config.geometry_source in _DA3:
         return "da3", config.da3_hash
     if config.geometry_source == "rgbd":
         return "rgbd", config.geometry_frame, config.geometry_tokens
