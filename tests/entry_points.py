@@ -1,4 +1,4 @@
-"""Small policies and batches for the tests of what LeRobot meets: config, policy, processors, checkpoints."""
+"""Small policies, batches and processors for the tests of LeRobot's entry points."""
 
 from typing import Any
 
@@ -63,7 +63,7 @@ def make_config(**changes: Any) -> PI05GeometryConfig:
 
 @torch.no_grad()
 def redraw(policy: PI05GeometryPolicy, seed: int = 0) -> PI05GeometryPolicy:
-    """Draw every parameter anew: a fresh network's zeros and ones hide errors."""
+    """Draw every parameter at random: the zeros and ones of a new network hide errors."""
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in policy.named_parameters():
         drawn = 0.15 * torch.randn(parameter.shape, generator=generator)
@@ -99,7 +99,7 @@ def make_observation(size: int = 2, seed: int = 0) -> dict[str, Any]:
 
 
 def make_batch(size: int = 2, seed: int = 0) -> dict[str, Any]:
-    """A batch as the preprocessor hands it to the policy, with actions; prompts of several lengths."""
+    """A batch as the preprocessor returns it, with actions; prompts of several lengths."""
     random = torch.Generator().manual_seed(seed + 1)
     lengths = 3 + torch.arange(size) % 3
     return make_observation(size, seed) | {
@@ -111,7 +111,7 @@ def make_batch(size: int = 2, seed: int = 0) -> dict[str, Any]:
 
 
 def make_stats() -> dict[str, dict[str, Tensor]]:
-    """Dataset statistics that leave a state in [-1, 1] as it is, and scale actions."""
+    """Dataset statistics that do not change a state in [-1, 1], and scale actions."""
     spread = torch.linspace(1.0, 2.0, ACTION_DIM)
     return {
         STATE: {"q01": -torch.ones(STATE_DIM), "q99": torch.ones(STATE_DIM)},

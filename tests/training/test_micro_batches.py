@@ -121,7 +121,7 @@ def test_gradients_add_to_those_that_are_there_and_are_handed_over_once():
     assert_same(gradients(parts), gradients(whole), 2e-6)
     loss, _ = parts.forward(batch)
     loss.backward(retain_graph=True)
-    with pytest.raises(RuntimeError, match="handed over once"):
+    with pytest.raises(RuntimeError, match="one backward pass"):
         loss.backward()
 
 

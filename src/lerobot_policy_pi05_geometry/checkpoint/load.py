@@ -1,4 +1,4 @@
-"""A checkpoint with its processors, ready to act: what lerobot-eval does, for our own commands."""
+"""Load a checkpoint with its processors, as lerobot-eval does, for the commands of this package."""
 
 import importlib.util
 from collections.abc import Callable
@@ -24,10 +24,10 @@ class LoadedPolicy:
 
 
 def load_policy(checkpoint: str | Path, device: str = "cpu", environment: Any | None = None) -> LoadedPolicy:
-    """Load a checkpoint folder or hub id; LoRA is folded into the weights.
+    """Load a checkpoint folder or hub id. LoRA is merged into the weights.
 
     environment: a LeRobot `EnvConfig` whose features the policy has to fit, or None.
-    Raises FileNotFoundError or ValueError, with one sentence, for what is no checkpoint of this policy.
+    Raises FileNotFoundError or ValueError if it is not a checkpoint of this policy.
     """
     require_policy_type(checkpoint, PI05GeometryPolicy.name)
     config = PreTrainedConfig.from_pretrained(checkpoint)
@@ -48,9 +48,9 @@ def load_policy(checkpoint: str | Path, device: str = "cpu", environment: Any | 
 
 
 def _fold_lora(checkpoint: str | Path, config: PreTrainedConfig) -> PI05GeometryPolicy:
-    """The policy that a LoRA checkpoint was trained from, with what was trained folded into its weights.
+    """The base policy of a LoRA checkpoint, with the LoRA merged into its weights.
 
-    Raises ImportError without PEFT, ValueError or FileNotFoundError if it is not known or there what it was trained from.
+    Raises ImportError without PEFT, ValueError or FileNotFoundError if the base policy is not named or does not exist.
     """
     if importlib.util.find_spec("peft") is None:
         raise ImportError(

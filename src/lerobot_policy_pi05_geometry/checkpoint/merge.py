@@ -1,4 +1,4 @@
-"""A checkpoint trained with LoRA -> one without, that acts the same and needs neither PEFT nor the policy it came from."""
+"""Merge LoRA into the weights: the new checkpoint acts the same, and needs neither PEFT nor the base policy."""
 
 import shutil
 from pathlib import Path
@@ -10,10 +10,10 @@ ADAPTER_CONFIG = "adapter_config.json"
 
 
 def merge(checkpoint: Path, output: Path) -> None:
-    """Write `output`: the weights with LoRA folded in, settings and processors.
+    """Write `output`: the weights with LoRA merged into them, the settings and the processors.
 
-    Raises FileNotFoundError if `checkpoint` has no LoRA or what it was trained from is gone, FileExistsError if `output`
-    is there; then nothing is left behind.
+    Raises FileNotFoundError if `checkpoint` has no LoRA or its base policy does not exist, FileExistsError if `output`
+    exists. Then nothing is written.
     """
     if not (checkpoint / ADAPTER_CONFIG).is_file():
         raise FileNotFoundError(f"{checkpoint} has no {ADAPTER_CONFIG}: it was not trained with LoRA.")

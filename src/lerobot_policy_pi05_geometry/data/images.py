@@ -18,7 +18,7 @@ _TOLERANCE = 0.02  # what resizing with cubic interpolation or a video codec may
 def prepare_images(
     batch: Mapping[str, Tensor], config: "PI05GeometryConfig", device: torch.device
 ) -> tuple[list[Tensor | None], list[Tensor]]:
-    """RGB cameras in the form SigLIP expects.
+    """The RGB cameras of a batch as SigLIP's inputs.
 
     Images are (B, 3, H, W) or (B, H, W, 3), uint8 or float in [0, 1]; they are resized with black padding to
     `image_resolution` and scaled to [-1, 1], as openpi does.

@@ -1,14 +1,14 @@
 """torchao's AdamW with moments in 8 bits, in a form that LeRobot's loop can run, save and resume.
 
 torchao quantises both moments in blocks of 256 numbers (Dettmers et al., arXiv 2110.02861), in tensors of 4,096 numbers
-or more. Four things stand between it and LeRobot:
+or more. Four of its properties do not fit LeRobot and are changed here:
 
-* A state dict holds tensors of a class of its own, which safetensors cannot write: here it holds codes and scales.
-* A learning rate is a tensor, which LeRobot's JSON and its logging do not take: here it is one during `step` alone.
-* Loading casts a state to the dtype of its parameter and moves it to its device: here codes stay codes, and the step
-  counter stays on the CPU, so that a resumed run raises the same betas to the same powers.
-* Moments below 1e-12 are lost: gradients behind a closed gate are that small. Groups with `full_state` keep their
-  parameters' dtype.
+* Its state dict holds tensors of its own class, which safetensors cannot write. Here it holds codes and scales.
+* Its learning rate is a tensor, which LeRobot cannot write to JSON or log. Here it is a tensor during `step` only.
+* Loading casts a state to the dtype of its parameter and moves it to its device. Here codes stay codes, and the step
+  counter stays on the CPU, so that a resumed run computes the same powers of the betas.
+* Moments below 1e-12 are lost, and gradients behind a closed gate are that small. Groups with `full_state` keep their
+  moments in the dtype of their parameters.
 
 On a GPU torchao compiles the step (once per shape, seconds each); on a CPU it runs as it is, without a compiler.
 """
@@ -64,7 +64,7 @@ class AdamW8bit(TorchaoAdamW8bit):
         return found
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take up what `state_dict` returned."""
+        """Load what `state_dict` returned."""
         state = {index: _quantised(state) for index, state in state_dict["state"].items()}
         super().load_state_dict({**state_dict, "state": state})
 

@@ -1,7 +1,8 @@
 """LoRA through PEFT (`--peft.*`): which matrices get it, and which modules are trained in full.
 
-The new parameters have no pretraining that a low rank could be a correction of, and the flow's projections are small: they
-are trained in full. So that a resumed run draws the noise it would have drawn, the count of its steps is saved with them.
+The new parameters are trained in full, since they have no pretrained values that a low rank could correct. The flow's
+projections are small and trained in full too. The count of optimiser steps is saved with them: noise is keyed by it, so a
+resumed run draws the same noise.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -10,13 +11,13 @@ if TYPE_CHECKING:
     from ..configuration_pi05_geometry import PI05GeometryConfig
 
 _PROJECTIONS = r"(?:self_attn\.[qkvo]_proj|mlp\.(?:gate|up|down)_proj)"
-_READ_IN_THE_LAST_LAYER = r"self_attn\.[kv]_proj"  # of prefix and geometry: nothing reads the rest
+_READ_IN_THE_LAST_LAYER = r"self_attn\.[kv]_proj"  # of prefix and geometry; their other matrices there are not used
 
 
 def peft_targets(config: "PI05GeometryConfig") -> dict[str, Any]:
     """`target_modules` (a regular expression) and `modules_to_save` of PEFT, for `config.lora_targets`.
 
-    Matrices that feed nothing get no LoRA: it would never have a gradient.
+    Matrices whose output is not used get no LoRA: it would never have a gradient.
     """
     network = config.network()
     last = network.expert.depth - 1

@@ -1,12 +1,12 @@
-"""A training batch with the memory of a part of it: gradients of one micro-batch after the other, inside one loss.
+"""Micro-batches inside one loss: a large training batch with the memory of a small one.
 
-LeRobot's loop calls forward, backward and the optimiser once per batch. So the gradients of the micro-batches are computed
-in the forward pass, where each micro-batch's activations are freed before the next begins, and an autograd function whose
-inputs are the trainable parameters hands the sums over in the backward pass. To whatever stands around it (DDP, gradient
-clipping, a loss scale) that is an ordinary loss: each parameter gets its gradient once per step.
+LeRobot's loop calls forward, backward and the optimiser once per batch. So the gradients of all micro-batches are computed
+in the forward pass. The activations of one micro-batch are freed before the next begins. An autograd function, whose inputs
+are the trainable parameters, returns the sums of the gradients in the backward pass. For DDP, gradient clipping and a loss
+scale this is an ordinary loss: each parameter gets its gradient once per step.
 
-A loss per sample has weights that are known in the backward pass only. There, micro-batches run forward without a graph
-first and again in the backward pass: one forward pass more.
+A loss per sample has weights that are known in the backward pass only. Then micro-batches run forward without a graph, and
+once more in the backward pass.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,13 +30,13 @@ def sum_of(parts: Sequence[Part], parameters: Sequence[nn.Parameter]) -> Tensor:
 
 
 def each_of(parts: Sequence[Part], parameters: Sequence[nn.Parameter]) -> Tensor:
-    """Losses per sample (B,), put together from the parts' (b,); gradients by `parameters` are computed when asked for."""
+    """Losses per sample (B,), joined from the parts' (b,); gradients by `parameters` are computed in the backward pass."""
     losses: Tensor = _GradientsInBackward.apply(parts, *parameters)
     return losses
 
 
 def rows_of(batch: Mapping[str, Any], size: int, rows: slice) -> dict[str, Any]:
-    """Those rows of a batch of `size` samples; what belongs to the whole batch stays as it is."""
+    """Some rows of a batch of `size` samples. Entries that are not per sample are kept whole."""
 
     def per_sample(key: str, value: Any) -> bool:
         if isinstance(value, Tensor):
@@ -48,7 +48,7 @@ def rows_of(batch: Mapping[str, Any], size: int, rows: slice) -> dict[str, Any]:
 
 
 def require_whole_parameters(module: nn.Module) -> None:
-    """Raise ValueError if FSDP shards the parameters of `module`: it gathers and reduces them in passes of its own."""
+    """Raise ValueError if FSDP shards the parameters of `module`: it expects one backward pass over its units."""
     sharded = any(isinstance(m, FullyShardedDataParallel) for m in module.modules())
     if sharded or any(isinstance(p, DTensor) for p in module.parameters()):
         raise ValueError(
@@ -60,8 +60,8 @@ def require_whole_parameters(module: nn.Module) -> None:
 class _GradientSums:
     """Sums of gradients over several backward passes, one buffer per parameter.
 
-    A hook adds each gradient as soon as it is there and lets go of it, so that the sums and all gradients of one pass
-    are never held at once. `torch.autograd.grad` leaves `.grad` and DDP's hooks alone.
+    A hook adds each gradient to its sum as soon as autograd has computed it, and frees it. So the sums and all gradients of
+    one pass are never in memory together. `torch.autograd.grad` does not touch `.grad` and does not run DDP's hooks.
     """
 
     def __init__(self, parameters: Sequence[Tensor]) -> None:
@@ -78,7 +78,7 @@ class _GradientSums:
                     self.sums[index] = gradient.detach().clone()
                 else:
                     found.add_(gradient.detach())
-                return gradient.new_zeros(()).expand(gradient.shape)  # what autograd keeps until the pass ends
+                return gradient.new_zeros(()).expand(gradient.shape)  # autograd keeps this one until the pass ends
 
             return hook
 
@@ -90,7 +90,7 @@ class _GradientSums:
                 handle.remove()
 
     def result(self) -> list[Tensor]:
-        """One gradient per parameter, zero where none came: DDP waits for every parameter that the loss hangs on."""
+        """One gradient per parameter, zeros where there was none: DDP waits for every input of the autograd function."""
         found = zip(self.sums, self.parameters, strict=True)
         return [torch.zeros_like(parameter) if total is None else total for total, parameter in found]
 
@@ -115,7 +115,7 @@ class _GradientsInForward(torch.autograd.Function):
         gradients, ctx.gradients = ctx.gradients, None
         if gradients is None:
             raise RuntimeError(
-                "The gradients of a batch in micro-batches are handed over once; call forward again before backward."
+                "A loss in micro-batches has one backward pass, since its gradients are freed then; call forward again."
             )
         for gradient in gradients:
             gradient.mul_(weight)

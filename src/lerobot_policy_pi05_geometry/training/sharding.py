@@ -1,8 +1,8 @@
 """FSDP units of the policy, for a training loop in plain torch (FSDP2, `torch.distributed.fsdp.fully_shard`).
 
-FSDP gathers a unit's parameters in hooks around its `__call__`, so a unit has to be a module that is called: a transformer
-layer, not a whole transformer, whose layers `PaliGemmaWithExpert` runs one by one for three segments. And a unit's
-parameters have one dtype, so modules that stay in float32 are units of their own.
+FSDP gathers a unit's parameters in hooks around its `__call__`. So a unit is a module that is called: a transformer layer, and
+not a whole transformer, since `PaliGemmaWithExpert` runs the layers one by one for three segments. All parameters of a unit have
+one dtype, so modules that stay in float32 are units of their own.
 """
 
 from typing import Any
