@@ -51,7 +51,7 @@ def server_process(checkpoint: Path, *options: str, log: Path, **env: str) -> It
     with log.open("w") as output:
         process = subprocess.Popen(command, env=environment(**env), stdout=output, stderr=subprocess.STDOUT)
         try:
-            end = time.monotonic() + 90
+            end = time.monotonic() + 300
             while "Serving" not in log.read_text():
                 assert process.poll() is None, log.read_text()
                 assert time.monotonic() < end, log.read_text()

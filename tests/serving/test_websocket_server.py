@@ -20,6 +20,7 @@ from lerobot_policy_pi05_geometry.serving.wire import decode, encode
 from tests.entry_points import ACTION_DIM, CHUNK
 
 from .running import FakeEngine, fake_server, load, local_chunk, make_request, real_server, serving
+from .test_wire import mutated
 
 KEY = "k" * 32
 
@@ -280,6 +281,24 @@ def test_a_client_that_does_not_wait_is_answered_in_order(running):
             connection.send(encode(mine(i)))
         for i in range(5):
             assert decode(connection.recv(), Limits())["actions"][0, 0] == i
+
+
+def test_others_are_served_while_one_sends_rubbish(running):
+    """Mutations of a real frame, each answered by one frame: a chunk or a sentence."""
+    random, real = np.random.default_rng(1), encode(mine(0))
+    good = PolicyClient(running.url)
+    refused = 0
+    with connect(running) as connection:
+        connection.recv()
+        for i in range(200):
+            connection.send(mutated(real, random))
+            good.send(mine(i))
+            told = connection.recv(timeout=30)
+            refused += isinstance(told, str)
+            assert isinstance(told, bytes) or ("\n" not in told and "its log says why" not in told), told
+            assert good.receive()["actions"][0, 0] == i
+    assert 50 < refused < 200
+    good.close()
 
 
 def test_many_robots_at_once_get_their_own_chunks(running, engine):

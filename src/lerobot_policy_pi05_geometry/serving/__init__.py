@@ -12,6 +12,7 @@
    keys                 the key that clients must know, and which addresses need one
    admission            who may connect: key, Origin, number of sessions; /healthz
    websocket_server     one session per connection
+   service              a checkpoint with all of this around it
    client               the other end, for Python programs
    remote/              `--policy.type=pi05_geometry_remote`
    lerobot_wire/        LeRobot's robot_client, its pickles read without pickle
