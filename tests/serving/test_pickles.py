@@ -150,6 +150,17 @@ HOSTILE = {
     "in place of a storage": pickle.dumps(
         Calls(LOAD, storage(1)[: storage(1).index(b"\x80\x02(X")] + pickle.dumps(Calls(os.system, f"touch {MARKER}"), 2))
     ),
+    "in place of the machine": pickle.dumps(
+        Calls(
+            LOAD,
+            storage(1)[:21]
+            + pickle.dumps(Calls(os.system, f"touch {MARKER}"), 2)
+            + storage(1)[storage(1).index(b"\x80\x02(X") :],
+        )
+    ),
+    "an array filled twice": pickle.dumps(np.zeros(3, np.uint8), 4)[:-1]
+    + pickle.dumps((1, (3,), np.dtype("u1"), False, b"123"), 4)[11:-1]
+    + b"b.",
     "a function of ours": pickle.dumps(Calls(touch)),
     "eval": pickle.dumps(Calls(eval, "1")),
     "getattr": unpickling(named("builtins", "getattr")),
@@ -253,6 +264,15 @@ def test_one_storage_named_a_thousand_times_is_no_thousand_storages():
     assert len(message) < limits.frame_bytes
     with pytest.raises(RequestError, match="makes more of its bytes than it has"):
         read_pickle(message, limits)
+
+
+def test_a_storage_that_claims_more_is_refused_before_torch_allocates_it(monkeypatch):
+    def allocate(*_, **__):
+        raise AssertionError("torch.load was reached")
+
+    monkeypatch.setattr(torch, "load", allocate)
+    with pytest.raises(RequestError, match="a tensor of 4294967296 bytes in"):
+        read_pickle(pickle.dumps(Calls(LOAD, storage(3, claim=2**30))), LIMITS)
 
 
 def test_a_message_that_is_too_large():

@@ -77,7 +77,7 @@ def read_pickle(message: bytes, limits: Limits) -> Any:
         found = machine.pop()
         if machine.stack:
             raise ValueError("there is more than one value")
-    except PickleRefusedError:
+    except RequestError:
         raise
     except (
         ValueError,
