@@ -1,13 +1,18 @@
 """Controlled studies: does geometry help? The demo is the smallest of them.
 
 ```
-   spec         a study: tasks x arms x seeds x conditions, from a TOML file (studies/)
-   arms         what a policy observes, and where geometry enters
-   conditions   camera poses and depth sensors of an evaluation
-   runs         one run: its inputs, its hash, its folder          worker       executes one run: record, train, evaluate
-   simulated    a run in the simulator                             held_out     a run on a user's dataset
-   launch       several runs at once, on one or more machines      results      one row per episode, cells, comparisons
-   statistics   intervals, paired tests, correction                report       the HTML page
-   training, training_log, frames_in_memory   LeRobot's training: started, its log parsed, small datasets kept in memory
+   spec             a study: tasks x arms x seeds x conditions, from a TOML file (studies/)
+   arms             what a policy observes, and where geometry enters
+   conditions       camera poses and depth sensors of an evaluation
+   plan             the runs of a study, in phases                  stopping    when an arm has stopped improving
+   runs             one run: its inputs, its hash, its folder       worker      executes one run: record, train, evaluate
+   recordings       expert episodes                                 launch      several runs at once, on one or more machines
+   pretraining      the π0.5 that a study starts from               warm_start  converting it for an arm
+   simulated        a run in the simulator                          adapted     a run that adapts another run's policy
+   modulation       one affine map of the visual tokens             held_out    a run on a user's dataset
+   results          one row per episode, cells, comparisons         statistics  intervals, paired tests, correction
+   claims           what is claimed, with thresholds                estimate    core-hours, before a study starts
+   report, growth_report, held_out_report                           the HTML pages
+   training, training_options, training_log, frames_in_memory      LeRobot's training, its log, small datasets in memory
 ```
 """
