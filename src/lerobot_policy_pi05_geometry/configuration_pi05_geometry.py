@@ -14,6 +14,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from .configuration_checks import check_choices, check_dropout, check_numbers, rtc_mode
 from .data.small_tokenizer import SMALL_TOKENIZER
 from .data.tokenizer import PALIGEMMA_TOKENIZER
+from .geometry.calibration import Rig
 from .geometry.camera import CameraCalibration
 from .geometry.depth import METRES_PER_UNIT
 from .geometry.keys import (
@@ -25,6 +26,7 @@ from .geometry.keys import (
     is_geometry_key,
     select_cameras,
 )
+from .geometry.kinematics import Arm
 from .model.ablations import AblationSettings, check_placement
 from .model.config import (
     GeometryExpert,
@@ -116,9 +118,16 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     # Camera -> key of its depth. None is needed for observation.images.<camera>_depth, nor for a dataset's depth maps
     # that LeRobot flags as such: the policy finds them.
     depth_keys: dict[str, str] = field(default_factory=dict)
+    optional_depth_cameras: list[str] = field(default_factory=list)  # depth cameras that observations may lack
+    rig: int | None = None  # of a policy trained on data of several rigs: which one it acts on
+    # LeRobot's rollout sets this from --use_torch_compile. It has no effect: the runner is faster, and compiling takes minutes.
+    compile_model: bool = False
 
     # Recorded about geometry
     calibration: dict[str, CameraCalibration] = field(default_factory=dict)
+    arms: dict[str, Arm] = field(default_factory=dict)
+    rigs: dict[str, Rig] = field(default_factory=dict)  # of data from several robots, instead of the two above
+    depth_bounds: dict[str, list[float]] = field(default_factory=dict)  # metres at which the data's depth codec ends
     calibration_given: bool = False  # whether it was given as a file, and so holds over a dataset's own
     geometry_features: dict[str, PolicyFeature] = field(default_factory=dict)  # depth and poses, by validate_features
     # Geometry cameras that a converted checkpoint has embeddings for, before any data has named them; then 0.

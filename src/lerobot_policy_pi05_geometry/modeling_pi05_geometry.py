@@ -15,7 +15,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from accelerate import init_empty_weights
@@ -31,6 +31,7 @@ from .configuration_checks import refuse_log_gate, rtc_mode
 from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
 from .data.images import ImageRangeCheck, prepare_images
 from .data.relative_actions import anchor_of, relative_to
+from .data.rtc import without_padding
 from .data.small_tokenizer import SMALL_TOKENIZER, small_number_ids
 from .data.statistics import check_stats, require_matching_kind
 from .data.training_batch import check_actions, require_finite_losses, valid_steps
@@ -39,9 +40,11 @@ from .geometry.da3 import Da3Encoder
 from .geometry.da3.weights import load_da3
 from .geometry.keys import camera_of
 from .geometry.resolve import resolve
+from .inference.cuda_graphs import PROMPT_STEP
 from .inference.sampler import ChunkSampler
 from .inference.side_stream import PendingGeometry
 from .model import PI05Pytorch
+from .model.config import RunnerName
 from .model.flow_matching import FlowDraw, draw_flow
 from .model.segments import GeometryTokens
 from .training.attention_share import AttentionShare
@@ -112,6 +115,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.progress = TrainingProgress()
+        self._acted_on = 0  # rows of the last observation; 0 before the first
         self._noise_seed = torch.initial_seed()
         self.update_size = UpdateSize()
         self._last_share: Tensor | None = None
@@ -342,6 +346,34 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self.image_range.reset()
         if self.geometry is not None:
             self.geometry.reset()
+        if self._acted_on and not self.training:
+            self.warm_up()
+
+    @torch.no_grad()
+    def warm_up(self, batch_size: int | None = None) -> None:
+        """Prepare for episodes of so many robots (as many as acted last, at first one): no chunk then waits for a preparation.
+
+        Where chunks are recorded (on a GPU), one is recorded for every length that a prompt can have. `reset` calls this from the
+        second episode on; call it after loading for a fast first one. It changes no action and draws no random number.
+        """
+        config, device, batch_size = self.config, self.training_step.device, batch_size or self._acted_on or 1
+        runner = cast(RunnerName, config.inference_runner)
+        if not self.sampler.records(runner):
+            self.sampler.prepare(runner)
+            return
+        side, geometry = config.image_resolution[0], None
+        if self.geometry is not None:
+            tokens = self.geometry.source.num_tokens
+            embs = torch.zeros(batch_size, tokens, self.model.geometry_width, device=device)
+            blank = GeometryTokens(embs, torch.zeros(batch_size, tokens, dtype=torch.bool, device=device))
+            geometry = PendingGeometry(tokens, lambda: blank)
+        images = [torch.zeros(batch_size, 3, side, side, device=device) for _ in config.image_features]
+        present = [torch.ones(batch_size, dtype=torch.bool, device=device) for _ in images]
+        noise = torch.zeros(batch_size, config.chunk_size, config.max_action_dim, device=device)
+        for length in range(PROMPT_STEP, config.tokenizer_max_length + PROMPT_STEP, PROMPT_STEP):
+            text = torch.zeros(batch_size, length, dtype=torch.int64, device=device)
+            there = torch.ones_like(text, dtype=torch.bool)
+            self.sampler(images, present, text, there, noise=noise, geometry=geometry, runner=runner)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -356,6 +388,9 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             self._action_queue.extend(chunk.transpose(0, 1))
         return self._action_queue.popleft()
 
+    # LeRobot's rollout wraps this in torch.compile on --use_torch_compile: minutes at the first chunk, for what the runner does
+    # faster. Under `disable` the wrapped function is the function.
+    @torch.compiler.disable
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """An action chunk (B, chunk_size, action_dim), normalised.
@@ -367,6 +402,9 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         """
         self.eval()
         self.image_range(batch, self.config)
+        self._acted_on = len(batch[OBS_LANGUAGE_TOKENS])
+        if kwargs.get("prev_chunk_left_over") is not None:
+            kwargs |= without_padding(kwargs["prev_chunk_left_over"], kwargs.get("inference_delay"))
         anchor = anchor_of(batch, self.config.use_relative_actions)  # (B, A)
         if anchor is not None and kwargs.get("prev_chunk_left_over") is not None:
             kwargs["prev_chunk_left_over"] = relative_to(anchor, kwargs["prev_chunk_left_over"])

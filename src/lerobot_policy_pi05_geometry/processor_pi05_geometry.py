@@ -17,6 +17,7 @@ from lerobot.processor import (
 from .configuration_pi05_geometry import PI05GeometryConfig
 from .data.normaliser_scale import NormaliserProbeStep, NormaliserScaleStep
 from .data.prompt import PromptProcessorStep
+from .data.raw_state import RawStateProcessorStep
 from .data.relative_actions import absolute_actions_processor, relative_actions_processor
 from .data.state_width import StateWidthStep
 from .data.statistics import check_stats
@@ -46,6 +47,7 @@ def make_pi05_geometry_pre_post_processors(
             steps.rename_observations,
             steps.add_batch_dim,
             StateWidthStep(),
+            RawStateProcessorStep(),
             relative_actions_processor(
                 enabled=config.use_relative_actions,
                 exclude_joints=config.relative_exclude_joints,

@@ -4,7 +4,9 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
+from lerobot_policy_pi05_geometry.geometry.calibration import Rig
 from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
+from lerobot_policy_pi05_geometry.geometry.placed_camera import PlacedCamera
 from lerobot_policy_pi05_geometry.geometry.rgbd import RgbdSource, depth_key
 
 seeds = st.integers(0, 2**31 - 1)
@@ -71,8 +73,10 @@ def depth_of_plane(height_of_plane: float, pose: Tensor, camera: CameraCalibrati
 def make_source(cameras: dict[str, CameraCalibration], grid: int, **changes) -> RgbdSource:
     """An `RgbdSource` in metres and the base frame, for depth of the calibration's own image size."""
     settings = {"base_frame": True, "unit": "m", "max_depth": 10.0} | changes
-    sizes = {name: (camera.size[1], camera.size[0]) for name, camera in cameras.items()}
-    return RgbdSource(tuple(cameras), grid, cameras, sizes, **settings)
+    sizes = settings.pop("sizes", {name: (camera.size[1], camera.size[0]) for name, camera in cameras.items()})
+    arms = settings.pop("arms", {})
+    placed = [PlacedCamera(name, {0: Rig(cameras, arms)}, size) for name, size in sizes.items()]
+    return RgbdSource(placed, grid, sizes, **settings)
 
 
 def random_depth(random: torch.Generator, batch: int, height: int, width: int) -> Tensor:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.cli import app
-from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
+from lerobot_policy_pi05_geometry.geometry.calibration import Rig, write_calibration_file
 from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
 from lerobot_policy_pi05_geometry.geometry.dataset_calibration import (
     read_dataset_calibration,
@@ -85,9 +85,9 @@ def policy_and_batch(root: Path, config: PI05GeometryConfig) -> tuple[PI05Geomet
 def test_depth_of_another_name_trains_and_acts_as_lerobots(tmp_path, key, flagged):
     given = {} if flagged else {"depth_keys": {"front": key}}
     root = write_dataset(tmp_path / "other", key, flagged)
-    write_dataset_calibration(root, {"front": FRONT}, given.get("depth_keys"))
+    write_dataset_calibration(root, Rig({"front": FRONT}), given.get("depth_keys"))
     usual = write_dataset(tmp_path / "usual", "observation.images.front_depth")
-    write_dataset_calibration(usual, {"front": FRONT})
+    write_dataset_calibration(usual, Rig({"front": FRONT}))
     policy, batch = policy_and_batch(root, fresh_config(**given))
     expected, expected_batch = policy_and_batch(usual, fresh_config())
 
@@ -126,9 +126,9 @@ def meta_of(root: Path) -> LeRobotDatasetMetadata:
 
 def test_calibration_is_kept_in_the_depth_features_info(root):
     before = meta_of(root).features
-    write_dataset_calibration(root, {"front": FRONT})
+    write_dataset_calibration(root, Rig({"front": FRONT}))
     meta = meta_of(root)
-    assert read_dataset_calibration(meta, {}) == {"front": FRONT}
+    assert read_dataset_calibration(meta, {}).cameras == {"front": FRONT}
     info = meta.features["observation.images.front_depth"]["info"]
     assert info["is_depth_map"]
     assert info.pop("calibration")["frame"] == "base"
@@ -136,32 +136,32 @@ def test_calibration_is_kept_in_the_depth_features_info(root):
 
 
 def test_a_command_stores_a_calibration_file_in_a_dataset(root, tmp_path):
-    write_calibration_file(tmp_path / "rig.json", {"front": FRONT})
+    write_calibration_file(tmp_path / "rig.json", Rig({"front": FRONT}))
     result = CliRunner().invoke(app, ["store-calibration", str(tmp_path / "rig.json"), f"--dataset.root={root}"])
     assert result.exit_code == 0, result.output
-    assert read_dataset_calibration(meta_of(root), {}) == {"front": FRONT}
+    assert read_dataset_calibration(meta_of(root), {}).cameras == {"front": FRONT}
     with pytest.raises(FileNotFoundError, match="holds no LeRobotDataset"):
-        write_dataset_calibration(tmp_path, {"front": FRONT})
+        write_dataset_calibration(tmp_path, Rig({"front": FRONT}))
 
 
 def test_a_camera_without_depth_keeps_it_beside_its_images(tmp_path):
     root = write_dataset(tmp_path / "data", "observation.images.wrist_depth")
-    write_dataset_calibration(root, {"front": FRONT})
+    write_dataset_calibration(root, Rig({"front": FRONT}))
     assert "calibration" in meta_of(root).features["observation.images.front"]["info"]
-    assert read_dataset_calibration(meta_of(root), {}) == {"front": FRONT}
+    assert read_dataset_calibration(meta_of(root), {}).cameras == {"front": FRONT}
 
 
 def test_a_calibration_of_no_camera_of_the_dataset_is_refused(root):
     with pytest.raises(ValueError, match=r"no camera 'back' to store a calibration of; its cameras are front\."):
-        write_dataset_calibration(root, {"back": FRONT})
+        write_dataset_calibration(root, Rig({"back": FRONT}))
 
 
 def test_two_places_that_contradict_each_other_are_refused(root):
-    write_dataset_calibration(root, {"front": FRONT})
+    write_dataset_calibration(root, Rig({"front": FRONT}))
     path = root / "meta" / "calibration.json"
-    write_calibration_file(path, {"front": FRONT})
-    assert read_dataset_calibration(meta_of(root), {}) == {"front": FRONT}
-    write_calibration_file(path, {"front": replace(FRONT, intrinsics=[31.0, 30.0, 13.5, 13.5])})
+    write_calibration_file(path, Rig({"front": FRONT}))
+    assert read_dataset_calibration(meta_of(root), {}).cameras == {"front": FRONT}
+    write_calibration_file(path, Rig({"front": replace(FRONT, intrinsics=[31.0, 30.0, 13.5, 13.5])}))
     with pytest.raises(ValueError, match=r"Camera 'front' has two calibrations that differ.*calibration_path") as error:
         read_dataset_calibration(meta_of(root), {})
     assert str(error.value).endswith(".")
@@ -173,11 +173,11 @@ def test_two_places_that_contradict_each_other_are_refused(root):
         ({"frame": "world"}, "only 'base'"),
         ({"intrinsics": [0, 0, 0, 0]}, "singular"),
         ({"size": None}, "Camera 'front'"),
-        ({"unit": "m"}, "needs the entries"),
+        ({"unit": "m"}, "cannot be read"),
     ],
 )
 def test_an_unusable_entry_is_refused_with_its_file(root, change, said):
-    write_dataset_calibration(root, {"front": FRONT})
+    write_dataset_calibration(root, Rig({"front": FRONT}))
     meta = meta_of(root)
     meta.features["observation.images.front_depth"]["info"]["calibration"].update(change)
     with pytest.raises(ValueError, match=said) as error:
@@ -190,7 +190,7 @@ def test_an_unusable_entry_is_refused_with_its_file(root, change, said):
 
 def test_what_streaming_does_to_the_unit_is_said(root):
     """LeRobot 0.6.1 ignores `depth_output_unit` with streaming: whoever declares metres on both sides is told why."""
-    write_dataset_calibration(root, {"front": FRONT})
+    write_dataset_calibration(root, Rig({"front": FRONT}))
     config = fresh_config(depth_unit="m")
     training = TrainPipelineConfig(
         dataset=DatasetConfig(NAME, root=str(root), streaming=True, depth_output_unit="m"), policy=config

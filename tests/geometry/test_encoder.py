@@ -127,13 +127,55 @@ def test_a_camera_that_failed_in_one_way_and_then_another_failed_once(caplog):
     assert [name in warning for name, warning in zip(("'left'", "'right'"), warnings, strict=True)] == [True, True]
 
 
-def test_one_dead_row_of_a_batch_is_masked_without_a_word(caplog):
+def test_a_camera_that_fails_in_one_row_of_a_batch_is_masked_and_said(caplog):
     encoder = make_encoder("front")
     observation = observe(encoder, batch=2)
     observation[depth_key("front")][1] = math.nan
-    _, pad = encoder(observation)
-    assert pad.any(dim=1).tolist() == [True, False]
+    for _ in range(2):
+        _, pad = encoder(observation)
+        assert pad.any(dim=1).tolist() == [True, False]
+    (warning,) = said(caplog, logging.WARNING)
+    assert "'front' delivers no geometry in row 1 of the batch" in warning
+
+
+def test_what_one_episode_saw_says_nothing_about_the_next(caplog):
+    """After robot A, robot B without a depth camera is refused, not masked."""
+    encoder = make_encoder("left", "right")
+    observation = observe(encoder)
+    encoder(observation)
+    encoder(failing(observation, "right", "missing"))
+    encoder.reset()
+    with pytest.raises(ValueError, match=r"no depth from camera\(s\) right"):
+        encoder(failing(observation, "right", "missing"))
+    caplog.clear()
+    encoder(failing(observation, "right", "zero"))
+    assert len(said(caplog, logging.WARNING)) == 1  # a failure of the episode before is no excuse for silence
+
+
+def test_values_of_a_row_are_checked_when_it_first_delivers():
+    encoder = make_encoder("front")
+    observation = observe(encoder, batch=2)
+    dead = observation[depth_key("front")].clone()
+    dead[1] = 0.0
+    encoder(observation | {depth_key("front"): dead})
+    wrong = observation[depth_key("front")].clone()
+    wrong[1] *= 1000
+    with pytest.raises(ValueError, match="unit"):
+        encoder(observation | {depth_key("front"): wrong})
+
+
+def test_an_optional_camera_may_be_missing_from_the_start(caplog):
+    encoder = make_encoder("left", "right")
+    encoder.source.optional = frozenset({"right"})
+    observation = observe(encoder)
+    for mode in (encoder.eval(), encoder.train()):
+        for how in ("missing", "zero", "NaN"):
+            _, pad = mode(failing(observation, "right", how))
+            assert pad[:, :CELLS].any()
+            assert not pad[:, CELLS:].any()
     assert not caplog.records
+    with pytest.raises(ValueError, match=r"no depth from camera\(s\) left"):
+        encoder(failing(observation, "left", "missing"))
 
 
 def test_values_are_looked_into_once_an_episode():

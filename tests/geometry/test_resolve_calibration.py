@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import pytest
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
-from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
+from lerobot_policy_pi05_geometry.geometry.calibration import Rig, write_calibration_file
 from lerobot_policy_pi05_geometry.geometry.resolve import resolve, resolve_calibration
+from lerobot_policy_pi05_geometry.geometry.rgbd import RgbdSource
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from tests.entry_points import make_calibration, make_config
 
@@ -22,16 +23,20 @@ def calibration_with_focal_length(focal: float) -> dict:
 def dataset(tmp_path) -> SimpleNamespace:
     """Metadata of a dataset that brings its own calibration, focal length 20."""
     (tmp_path / "dataset" / "meta").mkdir(parents=True)
-    write_calibration_file(tmp_path / "dataset" / "meta" / "calibration.json", calibration_with_focal_length(20.0))
+    write_calibration_file(tmp_path / "dataset" / "meta" / "calibration.json", Rig(calibration_with_focal_length(20.0)))
     return SimpleNamespace(root=tmp_path / "dataset", features={})
 
 
+def cameras_of(source: RgbdSource) -> dict:
+    return {name: placed.cameras[0] for name, placed in source.placed.items()}
+
+
 def focal_length(config: PI05GeometryConfig, meta: SimpleNamespace | None) -> float:
-    return resolve_calibration(config, meta)["front"].intrinsics[0]
+    return resolve_calibration(config, meta).cameras["front"].intrinsics[0]
 
 
 def test_a_given_file_comes_first(tmp_path, dataset):
-    write_calibration_file(tmp_path / "given.json", calibration_with_focal_length(10.0))
+    write_calibration_file(tmp_path / "given.json", Rig(calibration_with_focal_length(10.0)))
     config = make_config(calibration=calibration_with_focal_length(30.0), calibration_path=str(tmp_path / "given.json"))
     assert focal_length(config, dataset) == focal_length(config, None) == 10.0
 
@@ -59,7 +64,7 @@ def test_a_dataset_that_contradicts_the_checkpoint_is_an_error(dataset):
 
 
 def test_the_policy_keeps_what_it_read_and_not_where_from(tmp_path):
-    write_calibration_file(tmp_path / "given.json", calibration_with_focal_length(10.0))
+    write_calibration_file(tmp_path / "given.json", Rig(calibration_with_focal_length(10.0)))
     policy = PI05GeometryPolicy(make_config(calibration={}, calibration_path=str(tmp_path / "given.json")))
     assert policy.config.calibration == calibration_with_focal_length(10.0)
     assert policy.config.calibration_path is None
@@ -67,7 +72,7 @@ def test_the_policy_keeps_what_it_read_and_not_where_from(tmp_path):
     policy.save_pretrained(tmp_path / "saved")
     (tmp_path / "given.json").unlink()
     loaded = PI05GeometryPolicy.from_pretrained(tmp_path / "saved")
-    assert loaded.geometry.source.calibration == calibration_with_focal_length(10.0)
+    assert cameras_of(loaded.geometry.source) == calibration_with_focal_length(10.0)
 
 
 def test_a_file_that_is_not_there_is_an_error_and_not_the_next_choice(dataset):
@@ -82,13 +87,13 @@ def test_resolving_changes_no_configuration(dataset):
     before = deepcopy(config)
     source, changes = resolve(config, dataset)
     assert config == before
-    assert source.calibration == changes["calibration"] == calibration_with_focal_length(20.0)
+    assert cameras_of(source) == changes["calibration"] == calibration_with_focal_length(20.0)
     with pytest.raises(AssertionError):
         config.record({"no_such_field": 1})
 
 
 def test_the_policy_takes_the_datasets_calibration(dataset):
     policy = PI05GeometryPolicy(make_config(calibration={}), dataset_meta=dataset)
-    assert policy.geometry.source.calibration == calibration_with_focal_length(20.0)
+    assert cameras_of(policy.geometry.source) == calibration_with_focal_length(20.0)
     assert policy.config.calibration == calibration_with_focal_length(20.0)
     assert not policy.config.calibration_given

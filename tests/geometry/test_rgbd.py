@@ -146,8 +146,9 @@ def test_a_coarser_depth_image_of_the_same_camera_gives_the_same_points(seed):
     pose = camera_above_table(random)
     fine, coarse = calibrated(64, 96, pose), calibrated(32, 48, pose)
     coarse.intrinsics = fine.scaled_intrinsics(32, 48)
-    source = make_source({"front": fine}, 2)  # calibrated for the fine image, fed the coarse one
-    source.sizes["front"] = (32, 48)
+    source = make_source(
+        {"front": fine}, 2, sizes={"front": (32, 48)}
+    )  # calibrated for the fine image, fed the coarse one
     features, valid = source({depth_key("front"): depth_of_plane(0.0, pose, coarse)})
     expected, expected_valid = make_source({"front": fine}, 2)({depth_key("front"): depth_of_plane(0.0, pose, fine)})
     both = valid & expected_valid & (expected[..., FRACTION] > 0.99)

@@ -254,3 +254,53 @@ def test_rtc_can_be_switched_on_after_loading():
     rtc = {"prev_chunk_left_over": torch.randn(1, 4, ACTION_DIM), "inference_delay": 1, "execution_horizon": 4}
     found = policy.predict_action_chunk(batch, noise=noise, **rtc)
     assert torch.equal(found, make_rtc_policy().predict_action_chunk(batch, noise=noise, **rtc))
+
+
+def test_a_dry_queue_leaves_no_prefix():
+    """LeRobot fills what is missing of the previous chunk with zeros, which would pull the arm to the middle of its range."""
+    policy, batch, noise = make_rtc_policy(), make_batch(1), torch.randn(1, CHUNK, 8)
+    rtc = {"inference_delay": 2, "execution_horizon": 4}
+    unguided = policy.predict_action_chunk(batch, noise=noise)
+    for empty in (torch.zeros(4, ACTION_DIM), torch.zeros(1, 4, ACTION_DIM)):
+        found = policy.predict_action_chunk(batch, noise=noise, prev_chunk_left_over=empty, **rtc)
+        assert torch.equal(found, unguided)
+    left = torch.randn(1, 1, ACTION_DIM)
+    padded = torch.cat([left, torch.zeros(1, 3, ACTION_DIM)], dim=1)
+    found = policy.predict_action_chunk(batch, noise=noise, prev_chunk_left_over=padded, **rtc)
+    expected = policy.predict_action_chunk(
+        batch, noise=noise, prev_chunk_left_over=left, inference_delay=1, execution_horizon=4
+    )
+    assert torch.equal(found, expected)
+    assert not torch.allclose(found, unguided)
+    hole = torch.cat([left, torch.zeros(1, 1, ACTION_DIM), left], dim=1)  # a zero between others is an action
+    found = policy.predict_action_chunk(batch, noise=noise, prev_chunk_left_over=hole, **rtc)
+    assert not torch.allclose(found, expected)
+
+
+@pytest.mark.parametrize("compile_model", [True, False])
+def test_compilation_is_not_asked_for_twice(compile_model):
+    """As LeRobot's rollout does on --use_torch_compile=true: it sets the field, and wraps the method."""
+    policy, batch, noise = make_policy(compile_model=compile_model), make_batch(1), torch.randn(1, CHUNK, 8)
+    expected = policy.predict_action_chunk(batch, noise=noise)
+    torch._dynamo.reset()
+    torch._dynamo.utils.counters.clear()
+    policy.predict_action_chunk = torch.compile(policy.predict_action_chunk)
+    assert torch.equal(policy.predict_action_chunk(batch, noise=noise), expected)
+    assert torch.equal(policy.select_action(batch, noise=noise), expected[:, 0])
+    assert not torch._dynamo.utils.counters["stats"]  # no graph was captured
+
+
+def test_after_a_warm_up_no_prompt_is_recorded_in_an_episode(recording):
+    policy = make_policy(tokenizer_max_length=70)
+    batch, noise = make_batch(1), torch.randn(1, CHUNK, 8)
+    before = policy.predict_action_chunk(batch, noise=noise)
+    policy.reset()  # warms up, since the policy has acted
+    told = policy.sampler.explain()["CUDA graphs"]
+    random = torch.random.get_rng_state()
+    policy.warm_up()
+    assert torch.equal(torch.random.get_rng_state(), random)
+    for length in (5, 31, 32, 33, 64, 70):
+        text = {TOKENS: torch.full((1, length), 7), TOKEN_MASK: torch.ones(1, length, dtype=torch.bool)}
+        policy.predict_action_chunk(batch | text, noise=noise)
+    assert policy.sampler.explain()["CUDA graphs"] == told
+    assert torch.equal(policy.predict_action_chunk(batch, noise=noise), before)

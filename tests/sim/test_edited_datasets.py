@@ -58,7 +58,7 @@ def merged(recorded, folder) -> Path:
 
 
 def calibration_of(root: Path) -> dict[str, CameraCalibration]:
-    return read_dataset_calibration(LeRobotDataset(NAME, root=root).meta, {})
+    return read_dataset_calibration(LeRobotDataset(NAME, root=root).meta, {}).cameras
 
 
 def geometry_of(root: Path) -> list[tuple[torch.Tensor, torch.Tensor]]:

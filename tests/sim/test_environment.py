@@ -13,8 +13,9 @@ from lerobot.envs import preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_policy_pi05_geometry.data.quantiles import write_frame_quantiles
-from lerobot_policy_pi05_geometry.geometry.camera import check_rigid, transform, unproject
+from lerobot_policy_pi05_geometry.geometry.camera import transform, unproject
 from lerobot_policy_pi05_geometry.geometry.dataset_calibration import read_dataset_calibration
+from lerobot_policy_pi05_geometry.geometry.rigid import check_rigid
 from lerobot_policy_pi05_geometry.sim.cameras import CAMERA_RANGES, LOOK_AT
 from lerobot_policy_pi05_geometry.sim.configuration import MetaworldRgbdEnv
 from lerobot_policy_pi05_geometry.sim.environment import CAMERA, DEPTH_KEY, EXTRINSICS_KEY, RgbdMetaworldEnv
@@ -322,7 +323,7 @@ def test_quantiles_of_a_dataset_can_be_recomputed(recorded, tmp_path):
 
 def test_a_recording_brings_its_calibration(recorded):
     root, _ = recorded
-    camera = read_dataset_calibration(LeRobotDataset("local/two", root=root).meta, {})["front"]
+    camera = read_dataset_calibration(LeRobotDataset("local/two", root=root).meta, {}).cameras["front"]
     assert camera.size == [32, 32]
     assert camera.intrinsics[2:] == [15.5, 15.5]
     assert camera.extrinsics is None  # the pose comes with every frame

@@ -6,10 +6,11 @@
    checkpoints   inspect, bench, convert, export, merge
    datasets      quantiles, store-calibration, precompute       planning     plan
    serving       serve                       libero       libero-replay, libero-floors, libero-report
+   calibration   calibrate (board, camera, arm, hand-eye), scene
 ```
 """
 
-from . import studies, simulation, checkpoints, datasets, planning, serving, libero  # noqa: F401, I001 (the order of --help)
+from . import studies, simulation, checkpoints, datasets, planning, calibration, serving, libero  # noqa: F401, I001 (the order of --help)
 from .app import app, console
 
 __all__ = ["app", "console"]

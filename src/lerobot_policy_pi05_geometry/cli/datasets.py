@@ -40,13 +40,15 @@ def store_calibration(
     calibration: Annotated[Path, typer.Argument(help="Calibration file (JSON).")],
     dataset_root: Annotated[Path, typer.Option("--dataset.root", help="Folder of a LeRobotDataset.")],
 ) -> None:
-    """Store the calibration of cameras in a dataset's meta/info.json, which LeRobot's editing tools keep."""
+    """Store the calibration of cameras and arms in a dataset's meta/info.json, which LeRobot's editing tools keep."""
     from ..geometry.calibration import read_calibration_file
     from ..geometry.dataset_calibration import write_dataset_calibration
 
-    cameras = read_calibration_file(calibration)
-    write_dataset_calibration(dataset_root, cameras)
-    console.print(f"Stored the calibration of {', '.join(cameras)} in {dataset_root / 'meta' / 'info.json'}.")
+    found = read_calibration_file(calibration)
+    write_dataset_calibration(dataset_root, found)
+    console.print(
+        f"Stored the calibration of {', '.join(found.cameras) or 'several rigs'} in {dataset_root / 'meta' / 'info.json'}."
+    )
 
 
 @app.command()

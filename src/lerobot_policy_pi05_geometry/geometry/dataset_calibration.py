@@ -10,7 +10,8 @@ depth), beside LeRobot's own `is_depth_map` and `depth_unit`:
 
 LeRobot's tools carry a feature's `info` along: deleting, splitting and recomputing statistics keep it, and merging
 refuses datasets whose `info` differs, as two rigs' does. A file `meta/calibration.json` (see calibration.py) is read too;
-these tools drop it. An entry holds what the file says about one camera. LeRobot has no place for it yet (its issue 4417).
+these tools drop it. An entry holds what the file says about one camera; the arms stand in the `info` of `observation.state`, as
+`arms`. LeRobot has no place for it yet (its issue 4417).
 """
 
 import json
@@ -19,16 +20,26 @@ from pathlib import Path
 from typing import Any
 
 from ..weight_files.files import write_whole
-from .calibration import BASE_FRAME, CALIBRATION_FILE, calibration_content, parse_calibration, read_calibration_file
-from .camera import CameraCalibration
-from .keys import camera_of, depth_camera_name, depth_features, is_depth_key, is_depth_map
+from .calibration import (
+    BASE_FRAME,
+    CALIBRATION_FILE,
+    VERSION,
+    Calibration,
+    Rig,
+    calibration_content,
+    parse_calibration,
+    read_calibration_file,
+)
+from .keys import RIG, camera_of, depth_camera_name, depth_features, is_depth_key, is_depth_map
 
 INFO_ENTRY = "calibration"
+ARMS_ENTRY, RIGS_ENTRY = "arms", "rigs"
+_STATE = "observation.state"
 _INFO_FILE = Path("meta") / "info.json"
 
 
-def read_dataset_calibration(dataset_meta: Any, depth_keys: Mapping[str, str]) -> dict[str, CameraCalibration]:
-    """Calibration of a dataset's cameras; {} if it has none.
+def read_dataset_calibration(dataset_meta: Any, depth_keys: Mapping[str, str]) -> Calibration:
+    """Calibration of a dataset's cameras and arms; an empty one if it has none.
 
     dataset_meta: LeRobot's metadata (`features`, `root`). depth_keys: camera -> key of its depth, where it is not LeRobot's.
     Raises ValueError for an unusable entry, or if the two places contradict each other.
@@ -38,23 +49,33 @@ def read_dataset_calibration(dataset_meta: Any, depth_keys: Mapping[str, str]) -
     entries = {camera: dict(features[key]["info"][INFO_ENTRY]) for camera, key in keys.items()}
     frames = {camera: entry.pop("frame", None) for camera, entry in entries.items()}
     other = next((camera for camera, frame in frames.items() if frame != BASE_FRAME), None)
-    content = {"frame": BASE_FRAME if other is None else frames[other], "cameras": entries}
-    in_info = parse_calibration(content, root / _INFO_FILE) if entries else {}
+    content: dict[str, Any] = {"version": VERSION, "frame": BASE_FRAME if other is None else frames[other]}
+    rigs = (features.get(RIG, {}).get("info") or {}).get(RIGS_ENTRY)
+    if rigs is not None:
+        content["rigs"] = rigs
+    else:
+        content["cameras"] = entries
+        content["arms"] = (features.get(_STATE, {}).get("info") or {}).get(ARMS_ENTRY, {})
+    in_info = parse_calibration(content, f"The calibration in {root / _INFO_FILE}")
     file = root / "meta" / CALIBRATION_FILE
-    in_file = read_calibration_file(file) if file.is_file() else {}
-    for camera in in_info.keys() & in_file.keys():
-        if in_info[camera] != in_file[camera]:
+    in_file = read_calibration_file(file) if file.is_file() else Calibration()
+    for camera in in_info.cameras.keys() & in_file.cameras.keys():
+        if in_info.cameras[camera] != in_file.cameras[camera]:
             raise ValueError(
                 f"Camera '{camera}' has two calibrations that differ, in {root / _INFO_FILE} (feature {keys[camera]}) and in "
                 f"{file}; delete the wrong one, or give the right one with --policy.calibration_path."
             )
-    return in_file | in_info
+    for name in in_info.arms.keys() & in_file.arms.keys():
+        if in_info.arms[name] != in_file.arms[name]:
+            raise ValueError(
+                f"Arm '{name}' has two calibrations that differ, in {root / _INFO_FILE} and in {file}; delete the wrong one, or "
+                "give the right one with --policy.calibration_path."
+            )
+    return Calibration(in_file.cameras | in_info.cameras, in_file.arms | in_info.arms, in_file.rigs | in_info.rigs)
 
 
-def write_dataset_calibration(
-    root: Path, cameras: Mapping[str, CameraCalibration], depth_keys: Mapping[str, str] | None = None
-) -> None:
-    """Store the calibration of cameras in the `info` of a dataset's features, where LeRobot's tools keep it.
+def write_dataset_calibration(root: Path, rig: Rig, depth_keys: Mapping[str, str] | None = None) -> None:
+    """Store the calibration of cameras and arms in the `info` of a dataset's features, where LeRobot's tools keep it.
 
     depth_keys: as in `read_dataset_calibration`. Raises ValueError for a camera that the
     dataset does not have, FileNotFoundError if there is no dataset at `root`.
@@ -63,13 +84,21 @@ def write_dataset_calibration(
     if not path.is_file():
         raise FileNotFoundError(f"{root} holds no LeRobotDataset (meta/info.json is missing).")
     info = json.loads(path.read_text())
-    content = calibration_content(cameras)
-    for camera in cameras:
+    if isinstance(rig, Calibration) and rig.rigs:
+        if RIG not in info["features"]:
+            raise ValueError(f"The dataset at {root} has no {RIG}, by which a frame says which rig it is from.")
+        _add_info(info["features"][RIG], RIGS_ENTRY, calibration_content(rig)["rigs"])
+    content = calibration_content(Rig(rig.cameras, rig.arms))
+    for camera in rig.cameras:
         key = _feature_of(camera, info["features"], depth_keys or {})
-        feature = info["features"][key]
-        entry = {"frame": content["frame"], **content["cameras"][camera]}
-        feature["info"] = {**(feature.get("info") or {}), INFO_ENTRY: entry}
+        _add_info(info["features"][key], INFO_ENTRY, {"frame": BASE_FRAME, **content["cameras"][camera]})
+    if rig.arms:
+        _add_info(info["features"][_STATE], ARMS_ENTRY, content["arms"])
     write_whole(path, json.dumps(info, indent=4, ensure_ascii=False) + "\n")
+
+
+def _add_info(feature: dict[str, Any], name: str, value: Any) -> None:
+    feature["info"] = {**(feature.get("info") or {}), name: value}
 
 
 def _calibrated_features(features: Mapping[str, Any], depth_keys: Mapping[str, str]) -> dict[str, str]:

@@ -17,17 +17,30 @@ PLAUSIBLE_MEDIAN = (0.02, 20.0)
 # Neither is a measurement, so valid depth is above MIN_DEPTH and below the configured maximum.
 MIN_DEPTH = 0.02
 _CODEC_FLOOR = 0.01
+_BOUND_WIDTH = 0.0005  # metres: LeRobot rounds to millimetres when it decodes
+# LeRobot takes one count of a camera's raw depth for a millimetre, whatever the camera's scale is.
+LEROBOT_COUNT = 1e-3
 _UINT16_MAX = 65535
 # Pixels of a frame that its values are checked on: the median of 1,024 of them is within 3 percentiles of the whole frame's.
 SAMPLED_PIXELS = 1024
 _DTYPES = (torch.uint16, torch.int16, torch.int32, torch.float16, torch.float32, torch.float64)
 
 
-def to_metres(depth: Tensor, key: str, unit: str, size: tuple[int, int], max_depth: float) -> tuple[Tensor, Tensor]:
+def to_metres(
+    depth: Tensor,
+    key: str,
+    unit: str,
+    size: tuple[int, int],
+    max_depth: float,
+    factor: Tensor | float = 1.0,
+    bounds: tuple[float, float] = (0.0, math.inf),
+) -> tuple[Tensor, Tensor]:
     """Normalise a depth batch.
 
     depth: (B, 1, H, W), (B, H, W, 1) or (B, H, W). key: its name, for messages. unit: "mm" or "m". size: (H, W) that
-    the policy was configured with. max_depth: metres; what is as far or farther counts as not measured.
+    the policy was configured with. max_depth: metres; what is as far or farther counts as not measured. factor: true metres per
+    declared metre, a number or (B,): the camera's depth scale over LeRobot's. bounds: declared metres at which the data's codec
+    ends: holes read back as the lower one, all that is farther as the upper one.
 
     Returns depth in metres, z along the optical axis, (B, 1, H, W) float32 with zeros where not valid, and validity
     (B, 1, H, W) bool. NaN, inf, nearer than MIN_DEPTH, too far and the type's largest value are not valid.
@@ -48,11 +61,22 @@ def to_metres(depth: Tensor, key: str, unit: str, size: tuple[int, int], max_dep
             f"{key} has shape {tuple(depth.shape)}, but this policy expects depth of {size[0]} x {size[1]} pixels "
             "(height x width, one channel); use the camera resolution it was trained with."
         )
-    metres = depth.float() * METRES_PER_UNIT[unit]
-    valid = (
-        (metres > MIN_DEPTH) & (metres < max_depth) & ~is_largest_value(depth, unit)
-    )  # comparisons with NaN are False
+    declared = depth.float() * METRES_PER_UNIT[unit]
+    metres = declared * _per_row(factor, 4)
+    # Comparisons with NaN are False.
+    valid = (metres > MIN_DEPTH) & (metres < max_depth) & within(declared, bounds) & ~is_largest_value(depth, unit)
     return metres.masked_fill(~valid, 0.0), valid
+
+
+def within(declared: Tensor, bounds: tuple[float, float]) -> Tensor:
+    """Where declared metres are inside of the codec's bounds, and not at them."""
+    low, high = bounds
+    return (declared > (low + _BOUND_WIDTH if low > 0 else 0.0)) & (declared < high - _BOUND_WIDTH)
+
+
+def _per_row(factor: Tensor | float, dimensions: int) -> Tensor | float:
+    """A number, or (B,) as (B, 1, ...)."""
+    return factor.reshape(-1, *[1] * (dimensions - 1)) if isinstance(factor, Tensor) else factor
 
 
 def is_largest_value(depth: Tensor, unit: str) -> Tensor:
@@ -88,15 +112,27 @@ def check_measured(depth: Tensor, key: str) -> None:
             )
 
 
-def check_unit(depth: Tensor, key: str, unit: str) -> None:
+def check_unit(
+    depth: Tensor,
+    key: str,
+    unit: str,
+    factor: Tensor | float = 1.0,
+    bounds: tuple[float, float] = (0.0, math.inf),
+) -> None:
     """Raise ValueError if the distances show that the declared unit is wrong. A sample of pixels decides.
 
-    depth: as given to `to_metres`, before validity (a wrong unit would make everything "too far").
+    depth, factor, bounds: as given to `to_metres`, before validity (a wrong unit would make everything "too far").
     """
     pixels = sample_pixels(depth)
     metres = pixels.float() * METRES_PER_UNIT[unit]
-    seen = metres.isfinite() & (metres > 0) & ((metres - _CODEC_FLOOR).abs() > 1e-4) & ~is_largest_value(pixels, unit)
-    metres = metres.masked_fill(~seen, float("nan")).nanmedian(dim=1).values
+    seen = (
+        within(metres, bounds)
+        & metres.isfinite()
+        & (metres > 0)
+        & ((metres - _CODEC_FLOOR).abs() > 1e-4)
+        & ~is_largest_value(pixels, unit)
+    )
+    metres = (metres * _per_row(factor, 2)).masked_fill(~seen, float("nan")).nanmedian(dim=1).values
     low, high = PLAUSIBLE_MEDIAN
     wrong = (metres < low) | (metres > high)  # NaN (nothing measured) is neither
     if wrong.any():

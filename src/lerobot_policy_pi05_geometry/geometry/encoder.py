@@ -2,7 +2,9 @@
 
 In training, a missing camera or a frame of NaN is an error of the data. On a robot, a camera that has delivered geometry may
 fail: its key is missing, or no pixel is valid. Its tokens are then masked, and used again when it returns; both are logged once.
-A robot that never delivered the key is configured wrongly, which is an error. On a GPU a failure is logged one observation
+A robot that does not deliver the key in the first observation of an episode is configured wrongly, which is an error. All of this
+belongs to one episode and to one row of a batch: what one robot's camera did says nothing about another's. On a GPU a
+failure is logged one observation
 later, so that no chunk waits for the copy to the host.
 """
 
@@ -28,7 +30,7 @@ CHECKED_EVERY = 64
 
 
 class _CameraStatus(NamedTuple):
-    """Which cameras have a valid cell, (V,) bool, being copied to the host if it is on a GPU; and which were absent.
+    """Which cameras have a valid cell, (B, V) bool, being copied to the host if it is on a GPU; and which were absent.
 
     It is read with the next observation, when the copy has finished. Reading it at once would wait for the GPU.
     """
@@ -50,10 +52,11 @@ class _CameraStatus(NamedTuple):
     def pending(self) -> bool:
         return self.arrived is not None
 
-    def read(self) -> list[bool]:
+    def read(self) -> list[list[bool]]:
         if self.arrived is not None:
             self.arrived.synchronize()
-        return self.alive.tolist()
+        rows: list[list[bool]] = self.alive.tolist()
+        return rows
 
 
 class GeometryEncoder(nn.Module):
@@ -64,15 +67,15 @@ class GeometryEncoder(nn.Module):
         self.source = source
         self.adapter = make_adapter(source, width)
         self._seen: set[str] = set()
-        self._failed: set[str] = set()
-        self._checked = False
+        self._failed: set[tuple[int, str]] = set()  # rows and cameras
+        self._checked: set[int] = set()  # rows
         self._unread: _CameraStatus | None = None
         self._training_batches = 0
 
     def reset(self) -> None:
-        """Start of an episode: check the values of the next observation again."""
+        """Start of an episode, maybe of another robot: no camera has been seen, and none has failed."""
         self._update_status()
-        self._checked = False
+        self._seen, self._failed, self._checked = set(), set(), set()
 
     def forward(self, batch: Mapping[str, Tensor]) -> GeometryTokens:
         # A caller's autocast would round points to millimetres, and training has another autocast than inference.
@@ -98,11 +101,12 @@ class GeometryEncoder(nn.Module):
         unknown = [camera for camera in missing if camera not in self._seen | self.source.optional]
         if unknown:
             raise ValueError(self.source.missing_message(unknown))
+        rows = range(batch_like(batch).shape[0])
         if len(missing) == len(self.source.cameras):
-            self._report(set(missing))
+            self._report({(row, camera) for row in rows for camera in missing}, len(rows))
             return self._nothing(batch)
-        geometry = self.source(batch, check=not self._checked)
-        self._unread = _CameraStatus.of(geometry.valid.any(dim=-1).any(dim=0), set(missing))
+        geometry = self.source(batch, check=not self._checked.issuperset(rows))
+        self._unread = _CameraStatus.of(geometry.valid.any(dim=-1), set(missing))
         if not self._unread.pending:
             self._update_status()
         return geometry
@@ -112,10 +116,16 @@ class GeometryEncoder(nn.Module):
         status, self._unread = self._unread, None
         if status is None:
             return
-        alive = {camera for camera, ok in zip(self.source.cameras, status.read(), strict=True) if ok}
-        self._checked = self._checked or bool(alive)
-        self._seen |= alive - status.missing
-        self._report(set(self.source.cameras) - alive)
+        failed, rows = set(), status.read()
+        for row, alive in enumerate(rows):
+            if any(alive):
+                self._checked.add(row)
+            for camera, delivers in zip(self.source.cameras, alive, strict=True):
+                if not delivers:
+                    failed.add((row, camera))
+                elif camera not in status.missing:
+                    self._seen.add(camera)
+        self._report(failed, len(rows))
 
     def _nothing(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
         """Features of an observation without any geometry: all masked."""
@@ -126,10 +136,22 @@ class GeometryEncoder(nn.Module):
             torch.zeros(shape, dtype=torch.bool, device=like.device),
         )
 
-    def _report(self, failed: set[str]) -> None:
-        """Log once that a camera failed, and once that it is back."""
-        for camera in sorted(failed - self._failed):
-            logger.warning("Geometry camera '%s' delivers no geometry: its tokens are masked until it returns.", camera)
-        for camera in sorted(self._failed - failed):
-            logger.info("Geometry camera '%s' is back.", camera)
+    def _report(self, failed: set[tuple[int, str]], size: int) -> None:
+        """Log once that a camera failed, and once that it is back. size: rows of the batch.
+
+        An optional camera that the episode has not seen may stay away without a word.
+        """
+        expected = self._seen | (set(self.source.cameras) - self.source.optional)
+        for camera in self.source.cameras:
+            gone = [row for row, name in sorted(failed - self._failed) if name == camera]
+            back = [row for row, name in sorted(self._failed - failed) if name == camera]
+            if gone and camera in expected:
+                message = "Geometry camera '%s' delivers no geometry%s: its tokens are masked until it returns."
+                logger.warning(message, camera, _rows(gone, size))
+            if back and camera in expected:
+                logger.info("Geometry camera '%s' is back%s.", camera, _rows(back, size))
         self._failed = failed
+
+
+def _rows(rows: list[int], size: int) -> str:
+    return "" if len(rows) == size else f" in row {', '.join(map(str, rows))} of the batch"

@@ -14,6 +14,8 @@ DEPTH_SUFFIX = "_depth"
 IMAGE_PREFIX = "observation.images."
 CALIBRATION_PREFIX = "observation.calibration."
 _OBSERVATION_PREFIX = "observation."
+RAW_STATE = "observation.raw_state"  # the state before normalisation, which forward kinematics needs
+RIG = f"{CALIBRATION_PREFIX}rig"  # which rig a frame of merged data is from, (B,) or (B, 1)
 
 
 def camera_of(image_key: str) -> str:

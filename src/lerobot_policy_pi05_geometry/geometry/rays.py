@@ -10,9 +10,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from .camera import CameraCalibration, as_pose, check_rigid
+from .camera import CameraCalibration, as_pose
 from .keys import batch_like, extrinsics_key
 from .rgbd import WAVELENGTHS
+from .rigid import check_rigid
 from .source import GeometryFeatures, GeometrySource
 
 FEATURE_DIM = 6 + 2 * 6 * len(WAVELENGTHS)
@@ -33,7 +34,7 @@ class RaySource(GeometrySource):
     ) -> None:
         super().__init__()
         self.cameras, self.grid, self.feature_dim = cameras, grid, FEATURE_DIM
-        self.calibration = {camera: calibration[camera] for camera in cameras}
+        self.calibration = {camera: calibration[camera].as_recorded() for camera in cameras}
         directions = [camera_rays(self.calibration[camera], *sizes[camera], grid) for camera in cameras]
         self._directions: Tensor  # (V, G, 3), in each camera's frame
         self.register_buffer("_directions", torch.stack(directions), persistent=False)

@@ -3,19 +3,21 @@
 `resolve` reads the configuration and never changes it. The policy writes what it returns back once, with `config.record`.
 """
 
+from collections.abc import Mapping
 from copy import copy
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .calibration import read_calibration_file
-from .camera import CameraCalibration
+from .calibration import Calibration, Rig, read_calibration_file
 from .da3 import Da3Encoder, Da3Source
 from .da3.weights import load_da3
 from .dataset_calibration import read_dataset_calibration
+from .dataset_depth import check_depth_scale, codec_bounds
 from .feature_store import FeatureStoreSource
 from .feature_store.match import open_store
 from .keys import camera_of, extrinsics_key
+from .placed_camera import PlacedCamera
 from .random_tokens import RandomSource
 from .rays import FEATURE_DIM as RAY_FEATURES
 from .rays import RaySource
@@ -99,17 +101,27 @@ def _resolve_depth(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Re
             "--policy.depth_keys, or train with --policy.geometry_source=none (for a converted checkpoint: convert it with "
             "--geometry-source none)."
         )
-    changes |= _calibrated(config, dataset_meta, list(sizes))
-    calibration = changes["calibration"]
+    recorded, rigs = _calibrated(config, dataset_meta, list(sizes))
+    bounds = config.depth_bounds
+    if dataset_meta is not None:
+        check_depth_scale(rigs, dataset_meta, list(sizes), config.depth_keys)
+        bounds = codec_bounds(dataset_meta.features, list(sizes), config.depth_keys)
+    changes |= {**recorded, "depth_bounds": bounds}
+    unknown = set(config.optional_depth_cameras) - set(sizes)
+    if unknown:
+        raise ValueError(
+            f"optional_depth_cameras names {', '.join(sorted(unknown))}, but the data has depth from {', '.join(sizes)} only."
+        )
     source = RgbdSource(
-        tuple(sizes),
+        [PlacedCamera(camera, rigs, size, config.rig) for camera, size in sizes.items()],
         config.geometry_grid,
-        calibration,
         sizes,
         base_frame=config.geometry_frame == "base",
         unit=config.depth_unit,
         max_depth=config.max_depth,
         depth_keys=config.depth_keys,
+        bounds={camera: (low, high) for camera, (low, high) in bounds.items()},
+        optional=config.optional_depth_cameras,
         as_points=config.geometry_tokens == "points",
     )
     return Resolved(source, changes)
@@ -130,20 +142,33 @@ def _resolve_rays(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Res
         raise ValueError(
             "geometry_source=rays describes where the camera stands in the robot's base frame; leave geometry_frame=base."
         )
-    changes |= _calibrated(config, dataset_meta, list(keys))
+    recorded, rigs = _calibrated(config, dataset_meta, list(keys))
+    moving = [camera for camera in keys if any(rig.cameras[camera].mount is not None for rig in rigs.values())]
+    if len(rigs) > 1 or moving:
+        raise ValueError(
+            "geometry_source=rays knows cameras of one rig, which are fixed or give their pose with every frame; use "
+            f"geometry_source=rgbd for {'data of several rigs' if len(rigs) > 1 else 'the camera(s) ' + ', '.join(moving)}."
+        )
+    changes |= recorded
     sizes = {camera: config.image_features[key].shape[-2:] for camera, key in keys.items()}
     return Resolved(RaySource(tuple(keys), config.geometry_grid, changes["calibration"], sizes), changes)
 
 
-def _calibrated(config: "PI05GeometryConfig", dataset_meta: Any | None, cameras: list[str]) -> dict[str, Any]:
-    """Fields that record the calibration of these cameras, which is checked."""
+def _calibrated(
+    config: "PI05GeometryConfig", dataset_meta: Any | None, cameras: list[str]
+) -> tuple[dict[str, Any], dict[int, Rig]]:
+    """Fields that record the calibration of these cameras, which is checked; and the rigs by id."""
     calibration = resolve_calibration(config, dataset_meta)
-    check_calibration(config, calibration, cameras)
-    return {
-        "calibration": calibration,
+    rigs = choose_rigs(config, calibration)
+    check_calibration(config, rigs, cameras)
+    recorded = {
+        "calibration": calibration.cameras,
+        "arms": calibration.arms,
+        "rigs": calibration.rigs,
         "calibration_given": config.calibration_given or config.calibration_path is not None,
         "calibration_path": None,  # the checkpoint now carries the content
     }
+    return recorded, rigs
 
 
 def camera_names(config: "PI05GeometryConfig") -> tuple[str, ...]:
@@ -208,39 +233,56 @@ def _resolve_store(config: "PI05GeometryConfig", root: Path) -> Resolved:
     return Resolved(FeatureStoreSource(store, partial(_da3_source, recorded), config.optional_rgb_cameras()), changes)
 
 
-def resolve_calibration(config: "PI05GeometryConfig", dataset_meta: Any | None) -> dict[str, CameraCalibration]:
+def resolve_calibration(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Calibration:
     """The calibration to use: the file given, else what the checkpoint recorded, else the dataset's.
 
     Raises ValueError if the dataset's differs from the recorded one and no file says which of them holds.
     """
     if config.calibration_path is not None:
         return read_calibration_file(config.calibration_path)
+    recorded = Calibration(config.calibration, config.arms, config.rigs)
     if dataset_meta is None:
-        return config.calibration
+        return recorded
     of_dataset = read_dataset_calibration(dataset_meta, config.depth_keys)
-    if config.calibration and of_dataset and config.calibration != of_dataset and not config.calibration_given:
+    known, found = recorded != Calibration(), of_dataset != Calibration()
+    if known and found and recorded != of_dataset and not config.calibration_given:
         raise ValueError(
             f"The calibration of the dataset at {dataset_meta.root} differs from the one recorded in the checkpoint; say "
             "which holds with --policy.calibration_path."
         )
-    return config.calibration or of_dataset
+    return recorded if known else of_dataset
 
 
-def check_calibration(
-    config: "PI05GeometryConfig", calibration: dict[str, CameraCalibration], cameras: list[str]
-) -> None:
-    """Raise ValueError unless every camera has usable intrinsics, and a pose where one is needed."""
-    for camera in cameras:
-        if camera not in calibration:
-            known = ", ".join(sorted(calibration)) or "no camera"
-            raise ValueError(
-                f"Camera '{camera}' has no intrinsics (the calibration has {known}); give a calibration file with "
-                "--policy.calibration_path, or store it in the dataset with pi05-geometry store-calibration."
-            )
-        calibration[camera].check(camera)
-        posed = calibration[camera].extrinsics is not None or extrinsics_key(camera) in config.geometry_features
-        if config.geometry_frame == "base" and not posed:
-            raise ValueError(
-                f"Camera '{camera}' has no extrinsics: neither in its calibration nor as {extrinsics_key(camera)} in "
-                "the data; give them, or set --policy.geometry_frame=camera."
-            )
+def choose_rigs(config: "PI05GeometryConfig", calibration: Calibration) -> dict[int, Rig]:
+    """Rigs by id. Raises ValueError if `config.rig` names one that is not there."""
+    if not calibration.rigs:
+        return {0: Rig(calibration.cameras, calibration.arms)}
+    rigs = {int(name): rig for name, rig in calibration.rigs.items()}
+    if config.rig is not None and config.rig not in rigs:
+        raise ValueError(f"--policy.rig={config.rig}, but the calibration has the rigs {', '.join(calibration.rigs)}.")
+    return rigs
+
+
+def check_calibration(config: "PI05GeometryConfig", rigs: Mapping[int, Rig], cameras: list[str]) -> None:
+    """Raise ValueError unless every depth camera has usable intrinsics on every rig, and a pose where one is needed."""
+    for number, rig in rigs.items():
+        where = f" on rig {number}" if len(rigs) > 1 else ""
+        for camera in cameras:
+            if camera not in rig.cameras:
+                known = ", ".join(sorted(rig.cameras)) or "no camera"
+                raise ValueError(
+                    f"Camera '{camera}' has no intrinsics{where} (the calibration has {known}); give a "
+                    f"calibration file with "
+                    "--policy.calibration_path, or store it in the dataset with pi05-geometry store-calibration."
+                )
+            found = rig.cameras[camera]
+            found.check(camera)
+            in_data = extrinsics_key(camera) in config.geometry_features
+            posed = found.extrinsics is not None or found.mount is not None or in_data
+            if config.geometry_frame == "base" and not posed:
+                raise ValueError(
+                    f"Camera '{camera}' has no extrinsics{where}: neither in its calibration (there as a mount, "
+                    f"if it is on "
+                    f"the arm) nor as {extrinsics_key(camera)} in the data; give them, or set --policy.geometry_frame=camera."
+                )
+        rig.check()

@@ -4,15 +4,18 @@ Points in the robot's base frame do not depend on the camera's pose. Points in t
 learn the pose, and success falls where the camera stands elsewhere than in training (docs/results.md).
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from .camera import CameraCalibration, as_pose, check_rigid, transform, unproject
+from .camera import as_pose, transform, unproject
 from .depth import check_measured, check_unit, to_metres
-from .keys import depth_key, extrinsics_key, find_depth_key
+from .keys import RAW_STATE, depth_key, extrinsics_key, find_depth_key
+from .placed_camera import PlacedCamera
+from .rigid import check_rigid
 from .source import GeometryFeatures, GeometrySource
 
 # Wavelengths of the Fourier features of a point, in metres: from a workspace down to the width of a finger.
@@ -25,30 +28,33 @@ class RgbdSource(GeometrySource):
     """Per cell: mean point (3), spread (3), fraction of valid pixels (1), Fourier features of the mean (6 per wavelength).
 
     as_points: instead, 16 points of the cell, which the adapter pools.
-    calibration: per camera. sizes: (H, W) of each camera's depth. base_frame: points in the robot's base instead of
-    the camera. unit, max_depth: see `depth.to_metres`. depth_keys: see `keys.find_depth_key`.
+    placed: the cameras in token order. sizes: (H, W) of each camera's depth. base_frame: points in the robot's base instead of
+    the camera. unit, max_depth, bounds (by camera): see `depth.to_metres`. depth_keys: see `keys.find_depth_key`.
+    optional: cameras
+    that any observation may lack.
     Sources: Fourier features as in NeRF (Mildenhall et al., 2020), with wavelengths in metres.
     """
 
     def __init__(
         self,
-        cameras: tuple[str, ...],
+        placed: Sequence[PlacedCamera],
         grid: int,
-        calibration: Mapping[str, CameraCalibration],
         sizes: Mapping[str, tuple[int, int]],
         base_frame: bool,
         unit: str,
         max_depth: float,
         depth_keys: Mapping[str, str] | None = None,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        optional: Iterable[str] = (),
         as_points: bool = False,
     ) -> None:
         super().__init__()
-        self.cameras, self.grid = cameras, grid
+        self.cameras, self.grid = tuple(camera.name for camera in placed), grid
+        self.placed = {camera.name: camera for camera in placed}
+        self.bounds, self.optional = dict(bounds or {}), frozenset(optional)
         self.feature_dim, self.points = depth_features(as_points)
         self.sizes, self.base_frame, self.unit, self.max_depth = dict(sizes), base_frame, unit, max_depth
         self.depth_keys = dict(depth_keys or {})
-        self.calibration = {camera: calibration[camera] for camera in cameras}
-        self._on_device: dict[tuple[str, torch.device], tuple[Tensor, Tensor | None]] = {}
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
         return [
@@ -59,19 +65,30 @@ class RgbdSource(GeometrySource):
 
     def missing_message(self, cameras: list[str]) -> str:
         keys = ", ".join(self._expected_key(camera) for camera in cameras)
-        poses = ", ".join(extrinsics_key(camera) for camera in cameras)
+        on_arm = [camera for camera in cameras if self.base_frame and self.placed[camera].on_arm]
+        if on_arm:
+            need = (
+                f", and {RAW_STATE} for {', '.join(on_arm)}, whose pose follows from the joints (processors of new "
+                f"checkpoints copy "
+                "it; make this checkpoint's anew if they do not)"
+            )
+        else:
+            poses = ", ".join(extrinsics_key(camera) for camera in cameras)
+            need = f" (and, for a camera without extrinsics in its calibration, {poses})"
         return (
-            f"The observation has no depth from camera(s) {', '.join(cameras)}: expected {keys} (and, for a camera without "
-            f"extrinsics in its calibration, {poses}); connect the depth camera, rename its key with --rename_map, or train "
-            "with --policy.geometry_source=none."
+            f"The observation has no depth from camera(s) {', '.join(cameras)}: expected {keys}{need}; connect the depth camera, "
+            "rename its key with --rename_map, name it in --policy.optional_depth_cameras if it may be missing, or train with "
+            "--policy.geometry_source=none."
         )
 
     def _expected_key(self, camera: str) -> str:
         return self.depth_keys.get(camera, depth_key(camera))
 
     def _has_pose(self, camera: str, batch: Mapping[str, Tensor]) -> bool:
-        known = not self.base_frame or self.calibration[camera].extrinsics is not None
-        return known or extrinsics_key(camera) in batch
+        if not self.base_frame or extrinsics_key(camera) in batch:
+            return True
+        placed = self.placed[camera]
+        return placed.placed and (not placed.on_arm or RAW_STATE in batch)
 
     def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
         missing = self.missing_cameras(batch)
@@ -90,38 +107,32 @@ class RgbdSource(GeometrySource):
         """Features (B, G, C) and validity (B, G) of one camera."""
         key = find_depth_key(camera, batch, self.depth_keys)
         assert key is not None
-        raw = batch[key]
-        depth, valid = to_metres(raw, key, self.unit, self.sizes[camera], self.max_depth)
+        raw, placed, bounds = batch[key], self.placed[camera], self.bounds.get(camera, (0.0, math.inf))
+        rows = placed.rows(batch)
+        factor = placed.depth_factor(rows, raw.device)
+        depth, valid = to_metres(raw, key, self.unit, self.sizes[camera], self.max_depth, factor, bounds)
         if check:
-            check_unit(raw, key, self.unit)
-            if self.training:
+            placed.check_rigs(batch)
+            check_unit(raw, key, self.unit, factor, bounds)
+            if self.training and camera not in self.optional:
                 check_measured(raw, key)
-        points = unproject(depth, self._constants(camera, depth.device)[0])
+        points = unproject(depth, placed.intrinsics(rows, depth.device))
         if self.base_frame:
-            points = transform(self._pose(camera, batch, depth.device, check), points)
+            points = transform(self._pose(camera, batch, rows, depth.device, check), points)
         valid = valid & points.isfinite().all(dim=1, keepdim=True)  # with a pose of NaN no point is known
         return cell_points(points, valid, self.grid) if self.points else cell_statistics(points, valid, self.grid)
 
-    def _pose(self, camera: str, batch: Mapping[str, Tensor], device: torch.device, check: bool) -> Tensor:
-        """`base_T_camera`, (B, 4, 4) from the batch or (4, 4) from the calibration."""
+    def _pose(
+        self, camera: str, batch: Mapping[str, Tensor], rows: Tensor | None, device: torch.device, check: bool
+    ) -> Tensor:
+        """`base_T_camera`, (B, 4, 4) or (4, 4): from the batch, or from the calibration."""
         key = extrinsics_key(camera)
-        if key in batch:
-            pose = as_pose(batch[key], key)
-            if check:
-                check_rigid(pose, key)
-            return pose
-        fixed = self._constants(camera, device)[1]
-        assert fixed is not None
-        return fixed
-
-    def _constants(self, camera: str, device: torch.device) -> tuple[Tensor, Tensor | None]:
-        """Intrinsics (4,) for images of `sizes`, and `base_T_camera` (4, 4) or None. Kept, since a copy to a GPU blocks."""
-        if (camera, device) not in self._on_device:
-            calibration = self.calibration[camera]
-            intrinsics = torch.tensor(calibration.scaled_intrinsics(*self.sizes[camera]), device=device)
-            pose = calibration.extrinsics
-            self._on_device[camera, device] = intrinsics, None if pose is None else torch.tensor(pose, device=device)
-        return self._on_device[camera, device]
+        if key not in batch:
+            return self.placed[camera].poses(batch, rows, device)
+        pose = as_pose(batch[key], key)
+        if check:
+            check_rigid(pose, key)
+        return pose
 
 
 def depth_features(as_points: bool) -> tuple[int, int]:

@@ -103,6 +103,10 @@ class ChunkSampler(nn.Module):
     def _kind(self, runner: RunnerName) -> type[ChunkRunner]:
         return GraphRunner if runner == "fast" and self._make_backend(self._device).can_record else ChunkRunner
 
+    def records(self, runner: RunnerName = "fast") -> bool:
+        """Whether the runner that is asked for records chunks by the shape of their inputs."""
+        return runner != "plain" and self._kind(runner) is GraphRunner
+
     def prepare(self, runner: RunnerName = "fast") -> str | None:
         """Build the runner and its modulations, if they are not there. Returns why the plain path serves instead, or None."""
         reason = self._unsupported_reason(runner, set())

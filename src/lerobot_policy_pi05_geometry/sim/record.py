@@ -11,6 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from ..data.quantiles import write_frame_quantiles
+from ..geometry.calibration import Rig
 from ..geometry.dataset_calibration import write_dataset_calibration
 from .environment import ACTION_NAMES, CAMERA, DEPTH_KEY, EXTRINSICS_KEY, FPS, STATE_NAMES, RgbdMetaworldEnv
 from .tasks import make_expert
@@ -87,7 +88,7 @@ def record(
             yield done, frames is not None
         dataset.finalize()
         write_frame_quantiles(unfinished, repo_id, (OBS_STATE, ACTION))
-        write_dataset_calibration(unfinished, environment.calibration)
+        write_dataset_calibration(unfinished, Rig(environment.calibration))
         unfinished.rename(root)
     finally:
         environment.close()

@@ -194,7 +194,7 @@ def test_an_expert_episode_is_recorded_with_depth_poses_and_calibration(environm
     assert item["observation.images.front_depth"].shape[-2:] == (84, 84)
     assert item["observation.calibration.wrist.extrinsics"].shape == (16,)
     assert item["task"] == other.task_description
-    calibration = read_dataset_calibration(dataset.meta, {})
+    calibration = read_dataset_calibration(dataset.meta, {}).cameras
     assert set(calibration) == {"front", "wrist"}
     assert calibration["front"].extrinsics is None
     assert json.loads((root / "meta" / "info.json").read_text())["robot_type"] == "libero_panda"

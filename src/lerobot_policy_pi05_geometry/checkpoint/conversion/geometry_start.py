@@ -75,7 +75,8 @@ class GeometryStart:
     def calibrate(self, config: PI05GeometryConfig) -> None:
         """Record the calibration file in the configuration, if there is one."""
         if self.calibration is not None:
-            config.calibration = read_calibration_file(self.calibration)
+            given = read_calibration_file(self.calibration)
+            config.calibration, config.arms, config.rigs = given.cameras, given.arms, given.rigs
             config.calibration_given = True
 
 

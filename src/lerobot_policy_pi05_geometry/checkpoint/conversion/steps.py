@@ -8,6 +8,7 @@ switch them on.
 from typing import Any
 
 from ...data.normaliser_scale import NormaliserProbeStep, NormaliserScaleStep
+from ...data.raw_state import RawStateProcessorStep
 from ...data.relative_actions import absolute_actions_processor, relative_actions_processor
 from ...data.state_width import StateWidthStep
 
@@ -19,7 +20,8 @@ RELATIVE, ABSOLUTE = (
 )  # LeRobot's registered names
 _NORMALIZER, _UNNORMALIZER = "normalizer_processor", "unnormalizer_processor"
 _WIDTH = "pi05_geometry_state_width"
-_OURS_ALONE = (_WIDTH, "pi05_geometry_normaliser_probe", "pi05_geometry_normaliser_scale")
+_RAW_STATE = "pi05_geometry_raw_state"
+_OURS_ALONE = (_WIDTH, _RAW_STATE, "pi05_geometry_normaliser_probe", "pi05_geometry_normaliser_scale")
 
 
 def step_name(step: Step) -> str:
@@ -29,7 +31,8 @@ def step_name(step: Step) -> str:
 
 def preprocessor_to_ours(steps: list[Step]) -> list[Step]:
     """LeRobot's steps, or ours of an earlier version, with ours in their places around the normaliser."""
-    before = [StateWidthStep(**_settings(steps, _WIDTH)), relative_actions_processor(**_settings(steps, RELATIVE))]
+    width = StateWidthStep(**_settings(steps, _WIDTH))
+    before = [width, RawStateProcessorStep(), relative_actions_processor(**_settings(steps, RELATIVE))]
     result = []
     for step in steps:
         if step_name(step) == _NORMALIZER:

@@ -11,6 +11,7 @@ from datasets.utils.logging import disable_progress_bar
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from ...data.quantiles import write_frame_quantiles
+from ...geometry.calibration import Rig
 from ...geometry.dataset_calibration import write_dataset_calibration
 from ..record import FIRST_SEED
 from .environment import ACTION_NAMES, STATE_NAMES, RgbdLiberoEnv, depth_key, extrinsics_key
@@ -85,7 +86,7 @@ class DatasetWriter:
         """Write statistics and calibration, and put the dataset where it belongs."""
         self._dataset.finalize()
         write_frame_quantiles(self._unfinished, self._repo_id)
-        write_dataset_calibration(self._unfinished, calibration)
+        write_dataset_calibration(self._unfinished, Rig(calibration))
         self._unfinished.rename(self.root)
 
 

@@ -1,0 +1,204 @@
+"""The commands that make a calibration file: calibrate board, camera, arm, hand-eye; and scene, which shows what it says."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .app import app, console
+
+calibrate = typer.Typer(no_args_is_help=True, help="Calibrate a real robot's cameras (docs/real-robot.md).")
+app.add_typer(calibrate, name="calibrate")
+
+File = Annotated[Path, typer.Option("--file", help="Calibration file to read, if it is there, and to write.")]
+BoardText = Annotated[
+    str, typer.Option("--board", help="COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY], sides in mm as measured on the print.")
+]
+Root = Annotated[Path, typer.Option("--dataset.root", help="Folder of a LeRobotDataset.")]
+RepoId = Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")]
+DEFAULT_BOARD = "7x5:30:22:4X4_50"
+
+
+@calibrate.command()
+def board(
+    output: Annotated[Path, typer.Argument(help="PNG to write.")] = Path("board.png"),
+    board: BoardText = DEFAULT_BOARD,
+) -> None:
+    """Write the ChArUco board as a picture to print. Measure its squares afterwards: printers scale."""
+    import cv2
+
+    from ..robot.board import Board
+
+    made = Board.parse(board)
+    cv2.imwrite(str(output), made.picture())
+    console.print(
+        f"Print [bold]{output}[/bold] {made.columns * made.square * 1e3:.0f} x {made.rows * made.square * 1e3:.0f} mm "
+        f"large, glue "
+        "it onto something flat, and measure a square."
+    )
+
+
+@calibrate.command()
+def camera(
+    name: Annotated[str, typer.Option("--camera", help="Its name in the robot's configuration.")],
+    serial: Annotated[str, typer.Option(help="Serial number of the RealSense (lerobot-find-cameras realsense).")],
+    width: Annotated[int, typer.Option(help="As in the robot's configuration, before rotation.")] = 640,
+    height: Annotated[int, typer.Option(help="As in the robot's configuration, before rotation.")] = 480,
+    fps: Annotated[int, typer.Option(help="As in the robot's configuration.")] = 30,
+    rotation: Annotated[int, typer.Option(help="As in the robot's configuration: 0, 90, 180 or 270 (its -90).")] = 0,
+    file: File = Path("calibration.json"),
+) -> None:
+    """Read intrinsics, depth scale and the place of the colour stream from a connected RealSense."""
+    from dataclasses import replace
+
+    from ..geometry.calibration import write_calibration_file
+    from ..robot.realsense import read_camera
+
+    calibration = _read(file)
+    found = read_camera(serial, width, height, fps, rotation % 360)
+    before = calibration.cameras.get(name)
+    if before is not None:  # where it stands is still true
+        found = replace(found, extrinsics=before.extrinsics, mount=before.mount)
+    calibration.cameras[name] = found
+    write_calibration_file(file, calibration)
+    console.print(
+        f"{name}: focal lengths {found.intrinsics[0]:.1f} and {found.intrinsics[1]:.1f} px of {found.size[0]} x "
+        f"{found.size[1]}, one "
+        f"count of depth is {found.depth_scale * 1e3:g} mm. Wrote [bold]{file}[/bold]."
+    )
+
+
+@calibrate.command()
+def arm(
+    model: Annotated[Path, typer.Option(help="URDF or MJCF file of the arm.")],
+    dataset_root: Root,
+    dataset_repo_id: RepoId = "local/dataset",
+    name: Annotated[str, typer.Option("--arm", help="A name for it.")] = "arm",
+    base: Annotated[str | None, typer.Option(help="Link that is the base. Default: the file's root.")] = None,
+    joint: Annotated[
+        list[str] | None, typer.Option(help="JOINT=STATE_ENTRY, where they are not JOINT and JOINT.pos.")
+    ] = None,
+    flip: Annotated[list[str] | None, typer.Option(help="A joint that turns the other way than the file says.")] = None,
+    unit: Annotated[str, typer.Option(help="Of the joints in the state: degrees or radians.")] = "degrees",
+    file: File = Path("calibration.json"),
+) -> None:
+    """Write an arm's links and joints into the calibration: from its link file, and a dataset that names the state's entries."""
+    from dataclasses import replace
+
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from ..geometry.calibration import write_calibration_file
+    from ..robot.calibrate import make_arm, state_names
+    from ..robot.link_files import read_links
+
+    pairs = [text.partition("=") for text in joint or []]
+    if any(not sign or not entry for _, sign, entry in pairs):
+        raise ValueError("--joint is written JOINT=STATE_ENTRY, as elbow=elbow_flex.pos.")
+    calibration = _read(file)
+    names = state_names(LeRobotDataset(dataset_repo_id, root=dataset_root))
+    made = make_arm(read_links(model, base), names, {left: right for left, _, right in pairs}, unit)
+    known = [each.joint for each in made.joints]
+    if set(flip or []) - set(known):
+        raise ValueError(f"--flip names a joint that the state does not have; it has {', '.join(known)}.")
+    made.joints = [replace(each, sign=-1 if each.joint in (flip or []) else 1) for each in made.joints]
+    calibration.arms[name] = made
+    write_calibration_file(file, calibration)
+    still = sorted({link.joint for link in made.links if link.joint} - set(known))
+    console.print(
+        f"{name}: {', '.join(f'{each.joint} = {each.state}' for each in made.joints)}"
+        + (f"; not in the state, so always at 0: {', '.join(still)}" if still else "")
+        + f". Wrote [bold]{file}[/bold]."
+    )
+
+
+@calibrate.command("hand-eye")
+def hand_eye(
+    camera: Annotated[str, typer.Option(help="The camera to calibrate.")],
+    link: Annotated[str, typer.Option(help="Link that carries the camera, or, with --fixed, the board.")],
+    dataset_root: Root,
+    dataset_repo_id: RepoId = "local/dataset",
+    fixed: Annotated[
+        bool, typer.Option("--fixed", help="The camera stands still, and the arm carries the board.")
+    ] = False,
+    arm: Annotated[str, typer.Option(help="The arm's name in the calibration.")] = "arm",
+    board: BoardText = DEFAULT_BOARD,
+    file: File = Path("calibration.json"),
+    picture: Annotated[Path, typer.Option(help="PNG to write: what all cameras see, in the base frame.")] = Path(
+        "scene.png"
+    ),
+) -> None:
+    """Find where a camera is, and the joints' offsets, from a recording in which the arm moves and a board is seen."""
+    import numpy as np
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from ..geometry.calibration import write_calibration_file
+    from ..inspect.inspection import frame_batch
+    from ..inspect.scene import scene_figure, scene_of
+    from ..robot.board import Board
+    from ..robot.calibrate import calibrate_hand_eye
+
+    changed, found = calibrate_hand_eye(
+        dataset_root, dataset_repo_id, _read(file), camera, arm, link, Board.parse(board), not fixed
+    )
+    write_calibration_file(file, changed)
+    scene = scene_of(frame_batch(LeRobotDataset(dataset_repo_id, root=dataset_root), found.views[0]), changed)
+    scene_figure(scene).savefig(picture, dpi=130)
+    console.print(f"{len(found.views)} views. Board in the image and as predicted from the reported joints:")
+    for title, residuals in (("  all views", found.fitted), ("  held out", found.held_out)):
+        console.print(
+            f"{title}: {residuals.pixels:.1f} px, {residuals.millimetres:.1f} mm, {residuals.degrees:.2f} degrees "
+            f"(root mean square)"
+        )
+    console.print(
+        f"Noise alone leaves the camera open to {found.spread.millimetres:.1f} mm and {found.spread.degrees:.2f} "
+        f"degrees; joints were off "
+        f"by {np.degrees(found.deviation):.2f} degrees."
+    )
+    for joint, offset in found.offsets.items():
+        told = "0 by convention" if joint in found.fixed_joints else f"{np.degrees(offset):+.2f} degrees"
+        console.print(f"  offset of {joint}: {told}")
+    console.print(
+        f"No recording can tell the offset of {found.fixed_joints[0]} from a turn of the base, nor that of "
+        f"{found.fixed_joints[1]} from a "
+        f"turn of what the hand carries: both stay as they were. Wrote [bold]{file}[/bold]; look at [bold]{picture}[/bold]."
+    )
+
+
+@app.command()
+def scene(
+    dataset_root: Root,
+    dataset_repo_id: RepoId = "local/dataset",
+    file: Annotated[
+        Path | None, typer.Option("--file", help="Calibration file. Default: what the dataset carries.")
+    ] = None,
+    frame: Annotated[int, typer.Option(help="Index of the frame.")] = 0,
+    output: Annotated[Path, typer.Option(help="PNG to write.")] = Path("scene.png"),
+    rerun: Annotated[
+        Path | None, typer.Option(help="A file for the rerun viewer to write, too (needs rerun-sdk).")
+    ] = None,
+) -> None:
+    """What a calibration says: the points of all depth cameras in the base frame, with the arm's links drawn into them."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from ..geometry.calibration import read_calibration_file
+    from ..geometry.dataset_calibration import read_dataset_calibration
+    from ..inspect.inspection import frame_batch
+    from ..inspect.scene import log_to_rerun, scene_figure, scene_of
+
+    dataset = LeRobotDataset(dataset_repo_id, root=dataset_root)
+    calibration = read_dataset_calibration(dataset.meta, {}) if file is None else read_calibration_file(file)
+    seen = scene_of(frame_batch(dataset, frame), calibration)
+    if not seen.points:
+        raise ValueError(
+            "No camera of the calibration has both depth in the dataset and a pose; run pi05-geometry calibrate."
+        )
+    scene_figure(seen).savefig(output, dpi=130)
+    if rerun is not None:
+        log_to_rerun(seen, str(rerun))
+    console.print(f"Open [bold]{output}[/bold]")
+
+
+def _read(file: Path):
+    from ..geometry.calibration import Calibration, read_calibration_file
+
+    return read_calibration_file(file) if file.exists() else Calibration()

@@ -1,0 +1,162 @@
+"""From a recording and a calibration file to a better calibration file."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+
+from ..geometry.calibration import Calibration
+from ..geometry.camera import CameraCalibration, Mount, pose_of_sensor
+from ..geometry.depth import LEROBOT_COUNT
+from ..geometry.keys import depth_key
+from ..geometry.kinematics import Arm, ForwardKinematics, Link, StateJoint
+from .board import Board, board_pose
+from .dataset_views import find_views
+from .hand_eye import HandEye, solve_hand_eye
+from .hand_eye_problem import View
+
+MAX_SCALE_ERROR = 0.10  # of the depth of a board whose size is known
+
+
+class ImageStream(NamedTuple):
+    """The stream whose images show the board. stream_T_depth: (4, 4), depth camera in it."""
+
+    intrinsics: list[float]
+    distortion: list[float]
+    stream_T_depth: np.ndarray  # noqa: N815
+
+
+def make_arm(links: list[Link], names: list[str], given: dict[str, str] | None = None, unit: str = "degrees") -> Arm:
+    """An arm whose joints are state entries of the same name, `<joint>.pos` or `<joint>`.
+
+    names: of the dataset's state. given: joint -> state entry, where the names differ. A joint without an entry stays at 0.
+    """
+    given = given or {}
+    unknown = sorted(set(given.values()) - set(names))
+    if unknown:
+        raise ValueError(f"The state has no entry {', '.join(unknown)}; it has {', '.join(names)}.")
+    joints: list[StateJoint] = []
+    for link in links:
+        if not link.joint or link.joint in [joint.joint for joint in joints]:
+            continue
+        entry = given.get(link.joint) or next((n for n in (f"{link.joint}.pos", link.joint) if n in names), None)
+        if entry is not None:
+            metres = link.kind == "prismatic" and unit in ("degrees", "radians")
+            joints.append(StateJoint(link.joint, entry, names.index(entry), "metres" if metres else unit))
+    if not joints:
+        raise ValueError(
+            f"No joint of the link file has the name of a state entry ({', '.join(names)}); say which is which with "
+            f"--joint NAME=ENTRY."
+        )
+    arm = Arm(links, joints)
+    arm.check("arm")
+    return arm
+
+
+def state_names(dataset: LeRobotDataset) -> list[str]:
+    """Names of the state's entries. Raises ValueError if the dataset does not say them."""
+    names = dataset.meta.features[OBS_STATE].get("names")
+    if isinstance(names, dict):
+        names = next(iter(names.values()), None)
+    if not isinstance(names, list):
+        raise ValueError("The dataset does not name the entries of its state; record it with lerobot-record.")
+    return [str(name) for name in names]
+
+
+def calibrate_hand_eye(
+    root: Path, repo_id: str, calibration: Calibration, camera: str, arm_name: str, link: str, board: Board, wrist: bool
+) -> tuple[Calibration, HandEye]:
+    """A calibration with this camera's pose and the arm's joint offsets, and how good they are.
+
+    link: that carries the camera (wrist), or the board (fixed camera). Raises ValueError with one sentence.
+    """
+    if camera not in calibration.cameras:
+        raise ValueError(
+            f"The calibration has no camera '{camera}'; read it first with `pi05-geometry calibrate camera`."
+        )
+    if arm_name not in calibration.arms:
+        raise ValueError(f"The calibration has no arm '{arm_name}'; write it first with `pi05-geometry calibrate arm`.")
+    arm, of_camera = calibration.arms[arm_name], calibration.cameras[camera]
+    dataset = LeRobotDataset(repo_id, root=root)
+    names = state_names(dataset)
+    for joint in arm.joints:
+        if joint.index >= len(names) or names[joint.index] != joint.state:
+            raise ValueError(
+                f"State entry {joint.index} is not '{joint.state}' in this dataset; its state has {', '.join(names)}."
+            )
+    kinematics = ForwardKinematics(arm, [link])
+    image_key = f"{OBS_IMAGES}.{camera}"
+    views = find_views(dataset, image_key, kinematics, board)
+    stream = image_stream(of_camera, camera, dataset.meta.features.get(image_key, {}).get("shape"))
+    check_board_depth(dataset, camera, of_camera, stream, views, board)
+    found = solve_hand_eye(kinematics, views, board, stream.intrinsics, stream.distortion, wrist)
+    pose = pose_of_sensor(found.camera @ stream.stream_T_depth, of_camera.rotation)
+    placed = (
+        replace(of_camera, extrinsics=None, mount=Mount(arm_name, link, pose.tolist()))
+        if wrist
+        else replace(of_camera, extrinsics=pose.tolist(), mount=None)
+    )
+    joints = [replace(j, offset=j.offset + found.offsets.get(j.joint, 0.0)) for j in arm.joints]
+    changed = Calibration(
+        calibration.cameras | {camera: placed}, calibration.arms | {arm_name: replace(arm, joints=joints)}
+    )
+    changed.check()
+    return changed, found
+
+
+def image_stream(camera: CameraCalibration, name: str, shape: list[int] | None) -> ImageStream:
+    """The stream of a camera's colour images as they are recorded. shape: (height, width, 3) of the dataset's images."""
+    recorded = camera.as_recorded()
+    if recorded.color is None and camera.stream == "depth":
+        raise ValueError(
+            f"The calibration of camera '{name}' does not say where its colour stream stands, in whose images the "
+            f"board is; read both "
+            "streams with `pi05-geometry calibrate camera`, or set its stream to 'color' if depth is aligned to colour."
+        )
+    if recorded.color is None:
+        intrinsics, distortion, size, apart = recorded.intrinsics, [0.0] * 5, recorded.size, np.eye(4)
+    else:
+        color = recorded.color
+        intrinsics, distortion, size = color.intrinsics, color.distortion, color.size
+        apart = np.linalg.inv(np.array(color.depth_T_color))
+    if shape is not None and [shape[1], shape[0]] != size:
+        raise ValueError(
+            f"Images of camera '{name}' are {shape[1]} x {shape[0]} pixels, but its calibration holds for {size[0]} x "
+            f"{size[1]}; read it "
+            "again with the size that you record with."
+        )
+    return ImageStream(intrinsics, distortion, apart)
+
+
+def check_board_depth(
+    dataset: LeRobotDataset, name: str, camera: CameraCalibration, stream: ImageStream, views: list[View], board: Board
+) -> None:
+    """Raise ValueError if the depth of the board's corners is more than 10 % off what their size in the image says."""
+    key = depth_key(name)
+    if key not in dataset.meta.features or not views:
+        return
+    recorded = camera.as_recorded()
+    factor = 1.0 if camera.depth_scale is None else camera.depth_scale / LEROBOT_COUNT
+    ratios: list[float] = []
+    for view in views[:: max(1, len(views) // 8)]:
+        depth = dataset[view.frame][key].float().squeeze() * 1e-3 * factor  # LeRobot gives millimetres
+        corners = np.c_[board.corners[view.seen.ids], np.ones(len(view.seen.ids))]
+        camera_T_board = board_pose(board, view.seen, stream.intrinsics, stream.distortion)
+        points = corners @ (np.linalg.inv(stream.stream_T_depth) @ camera_T_board).T
+        fx, fy, cx, cy = recorded.scaled_intrinsics(*depth.shape)
+        u = np.rint(points[:, 0] / points[:, 2] * fx + cx).astype(int)
+        v = np.rint(points[:, 1] / points[:, 2] * fy + cy).astype(int)
+        inside = (u >= 0) & (v >= 0) & (u < depth.shape[1]) & (v < depth.shape[0])
+        measured = depth[torch.from_numpy(v[inside]), torch.from_numpy(u[inside])].numpy()
+        there = measured > 0.011  # 0, or what LeRobot's codec makes of it
+        ratios.extend((measured[there] / points[inside][there, 2]).tolist())
+    if len(ratios) >= 10 and abs(float(np.median(ratios)) - 1) > MAX_SCALE_ERROR:
+        raise ValueError(
+            f"Depth of camera '{name}' is {float(np.median(ratios)):.2f} times what the board's size says; read its "
+            f"depth_scale with "
+            "`pi05-geometry calibrate camera`, and measure the board's print."
+        )

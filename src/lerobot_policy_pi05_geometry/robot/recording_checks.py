@@ -1,0 +1,96 @@
+"""Recordings from which no calibration follows, each refused with one sentence that says what to do."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from ..geometry.kinematics import ForwardKinematics
+from .hand_eye_problem import View
+
+if TYPE_CHECKING:
+    from .hand_eye import Spread
+
+MIN_VIEWS = 12
+MIN_TURN = np.radians(30)  # between the two views whose links are turned furthest from each other
+MIN_TILT = np.radians(15)  # of the axes that the link turned about
+MIN_MOTION = np.radians(8)  # of each joint
+MAX_OFFSET_SPREAD = 1.5  # degrees
+MAX_POSE_SPREAD = 6.0, 1.5  # millimetres, degrees
+
+
+def check_views(kinematics: ForwardKinematics, views: list[View], seen: np.ndarray | None) -> None:
+    """Raise ValueError for views that are too few or too alike, and for a joint that never moved. seen: `camera_T_board`."""
+    if len(views) < MIN_VIEWS or seen is None:
+        raise ValueError(
+            f"The board was found in {len(views)} distinct views, but {MIN_VIEWS} are needed; record some 20 poses with the "
+            "board well lit and whole in the image, holding still for a second in each."
+        )
+    values = np.stack([view.values for view in views])
+    spans = np.ptp(values, axis=0)
+    board_turn = _largest_turn(seen[:, :3, :3])
+    if board_turn > MIN_TURN and spans.max() < np.radians(0.5):
+        raise ValueError(
+            "The state never changes although the images do, so it is not this arm's; record with the robot that "
+            "moves, and check "
+            "which state entries are its joints."
+        )
+    turns = kinematics.poses(torch.from_numpy(values))[:, 0, :3, :3].numpy()
+    if _largest_turn(turns) < MIN_TURN:
+        raise ValueError(
+            f"The views are too alike: link '{kinematics.links[0]}' turns by {np.degrees(_largest_turn(turns)):.0f} "
+            f"degrees at most, but "
+            f"{np.degrees(MIN_TURN):.0f} are needed; tilt and roll the hand between poses."
+        )
+    if _axis_tilt(turns) < MIN_TILT:
+        raise ValueError(
+            f"The views are too alike: link '{kinematics.links[0]}' turns about one axis only, which leaves the "
+            f"camera's place along "
+            "it open; tilt the hand in two directions, and roll it."
+        )
+    free = range(1, len(kinematics.joints) - 1)
+    still = [kinematics.joints[j] for j in free if spans[j] < MIN_MOTION]
+    if still:
+        raise ValueError(
+            f"Joint(s) {', '.join(still)} moved by less than {np.degrees(MIN_MOTION):.0f} degrees, so nothing says "
+            f"what their offset is; "
+            "move every joint between poses."
+        )
+
+
+def check_determined(kinematics: ForwardKinematics, views: list[View], spread: "Spread") -> None:
+    """Raise ValueError if the noise alone leaves an offset or the camera's pose open."""
+    open_ = {joint: value for joint, value in spread.offsets.items() if value > MAX_OFFSET_SPREAD}
+    if open_:
+        joint = max(open_, key=lambda name: open_[name])
+        span = np.degrees(np.ptp([view.values[kinematics.joints.index(joint)] for view in views]))
+        raise ValueError(
+            f"The views leave the offset of joint '{joint}' open (to {open_[joint]:.1f} degrees; it moved over "
+            f"{span:.0f}): move it "
+            "further, together with the joints before and after it."
+        )
+    if spread.millimetres > MAX_POSE_SPREAD[0] or spread.degrees > MAX_POSE_SPREAD[1]:
+        raise ValueError(
+            f"The views leave the camera's pose open (to {spread.millimetres:.0f} mm and {spread.degrees:.1f} "
+            f"degrees): bring the board "
+            "closer, and tilt the hand further in both directions."
+        )
+
+
+def _largest_turn(rotations: np.ndarray) -> float:
+    """Largest angle between two of (V, 3, 3)."""
+    traces = np.einsum("aij,bij->ab", rotations, rotations)
+    return float(np.arccos(((traces - 1) / 2).clip(-1, 1)).max())
+
+
+def _axis_tilt(rotations: np.ndarray) -> float:
+    """How far the axes that a link turned about are from one line, an angle; by relative rotations of 10 degrees or more."""
+    relative = np.einsum("aji,bjk->abik", rotations, rotations).reshape(-1, 3, 3)
+    vectors = Rotation.from_matrix(relative).as_rotvec()
+    lengths = np.linalg.norm(vectors, axis=1)
+    axes = vectors[lengths > np.radians(10)] / lengths[lengths > np.radians(10), None]
+    if not len(axes):
+        return 0.0
+    second = np.sqrt(np.linalg.eigvalsh(axes.T @ axes / len(axes))[-2].clip(0, 1))
+    return float(np.arcsin(second))
