@@ -209,11 +209,11 @@ def test_trained_real_time_chunking_keeps_what_is_executed():
 def test_what_is_left_over_must_fit(runner):
     policy = make_rtc_policy(rtc_mode="trained", rtc_training_max_delay=3)
     for left, delay, says in [
-        (torch.zeros(1, 5, ACTION_DIM), None, "needs inference_delay"),
-        (torch.zeros(1, 5, ACTION_DIM), 4, "trained with rtc_training_max_delay=3"),
-        (torch.zeros(1, 2, ACTION_DIM), 3, "has only 2 steps"),
-        (torch.zeros(1, CHUNK + 1, ACTION_DIM), 1, r"T <= \d+ and A <= 8, got"),
-        (torch.zeros(3, 5, ACTION_DIM), 1, "B = 1"),
+        (torch.ones(1, 5, ACTION_DIM), None, "needs inference_delay"),
+        (torch.ones(1, 5, ACTION_DIM), 4, "trained with rtc_training_max_delay=3"),
+        (torch.ones(1, 2, ACTION_DIM), 3, "has only 2 steps"),
+        (torch.ones(1, CHUNK + 1, ACTION_DIM), 1, r"T <= \d+ and A <= 8, got"),
+        (torch.ones(3, 5, ACTION_DIM), 1, "B = 1"),
     ]:
         with pytest.raises(ValueError, match=says):
             policy.predict_action_chunk(make_batch(1), prev_chunk_left_over=left, inference_delay=delay, runner=runner)
@@ -290,8 +290,8 @@ def test_compilation_is_not_asked_for_twice(compile_model):
     assert not torch._dynamo.utils.counters["stats"]  # no graph was captured
 
 
-def test_after_a_warm_up_no_prompt_is_recorded_in_an_episode(recording):
-    policy = make_policy(tokenizer_max_length=70)
+def test_after_a_warm_up_no_prompt_is_recorded_in_an_episode():
+    policy = record(make_policy(tokenizer_max_length=70))
     batch, noise = make_batch(1), torch.randn(1, CHUNK, 8)
     before = policy.predict_action_chunk(batch, noise=noise)
     policy.reset()  # warms up, since the policy has acted

@@ -8,6 +8,7 @@ state belong together, however slow the machine is.
 import math
 import threading
 import time
+from collections.abc import Callable
 from contextlib import contextmanager
 from types import SimpleNamespace
 
@@ -69,6 +70,7 @@ class World:
         self.motors = dict.fromkeys(JOINTS, 0.0)  # degrees, as the motors report them
         self.version = 0
         self.handed_over: dict[str, int] = {}  # by camera
+        self.enough: Callable[[], bool] = lambda: False  # whether to interrupt whoever reads the motors, as Ctrl+C does
 
     def move(self, goal: dict[str, float]) -> None:
         """Motors jump to where they are told, within the range of an SO-101."""
@@ -78,6 +80,8 @@ class World:
 
     def wait_for_cameras(self) -> dict[str, float]:
         """Positions of the motors, once every camera has handed over an image of them."""
+        if self.enough():
+            raise KeyboardInterrupt
         with self.lock:
             wanted = self.version
             self.lock.wait_for(lambda: all(seen >= wanted for seen in self.handed_over.values()), timeout=30)

@@ -147,7 +147,7 @@ def test_moving_frames_are_left_out():
 
 def test_frames_are_spread_out():
     values = np.radians([[0.0], [1.0], [10.0], [10.5], [40.0], [41.0]])
-    assert spread_out(values, np.arange(6), 3) == [0, 5, 2]
+    assert spread_out(values, np.arange(6), 3) == [0, 5, 3]
     assert len(spread_out(values, np.arange(6), 6)) == 3  # closer than 2 degrees says nothing new
 
 

@@ -6,6 +6,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+# The detector puts the centre of pixel (0, 0) at (0.5, 0.5) (measured on a board that was not even rendered), OpenCV's camera
+# model puts it at (0, 0).
+_PIXEL_CENTRE = 0.5
 MIN_CORNERS = 8  # of one image: fewer say little, and may lie on a line
 
 
@@ -88,7 +91,7 @@ class Board:
         found = self.corners[ids.ravel(), :2]
         if np.linalg.matrix_rank(found - found.mean(axis=0), tol=1e-6) < 2:
             return None
-        return Detection(ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(np.float64))
+        return Detection(ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(np.float64) - _PIXEL_CENTRE)
 
 
 def board_pose(

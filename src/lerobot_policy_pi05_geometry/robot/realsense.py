@@ -50,7 +50,7 @@ def calibration_of(depth: Any, color: Any, depth_scale: float, rotation: int = 0
     camera = CameraCalibration(
         _numbers(of_depth),
         [of_depth.width, of_depth.height],
-        depth_scale=float(np.float32(depth_scale).round(7)),
+        depth_scale=round(float(depth_scale), 8),
         rotation=rotation,
         color=stream,
     )
