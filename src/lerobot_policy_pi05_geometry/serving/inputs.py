@@ -183,7 +183,9 @@ def _expected(config: PI05GeometryConfig) -> Iterable[Input]:
     if config.geometry_source == "rgbd":
         for camera, size in config.depth_cameras().items():
             yield Input(depth_key(camera), size, ("<u2", "<f4"), config.depth_unit, True)
-            posed = config.geometry_frame == "camera" or config.calibration[camera].extrinsics is not None
+            known = config.calibration.get(camera)  # data of several rigs has its calibration in config.rigs
+            placed = known is None or known.extrinsics is not None or known.mount is not None
+            posed = config.geometry_frame == "camera" or placed
             yield Input(extrinsics_key(camera), (4, 4), _FLOATS, "base_T_camera in metres, OpenCV axes", not posed)
     state = config.robot_state_feature
     assert state is not None  # validate_features adds it
