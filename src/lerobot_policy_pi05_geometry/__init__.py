@@ -1,19 +1,28 @@
 """π0.5 with a geometry segment: a LeRobot policy plugin.
 
 ```
-   cli                                          the pi05-geometry command
-   study                                        experiments: tasks x arms x seeds x conditions
-   inspect, planner, sim, serving               pictures and timings, memory planning, simulated RGB-D robots, robots elsewhere
-   checkpoint, precompute                       checkpoints loaded, merged and converted; features computed in advance
-   modeling_, processor_                        LeRobot's entry points: the policy and its processors
-   configuration_                               every setting of the policy
-   inference, training, data, geometry          action chunks, optimisation, inputs, observation -> geometry tokens
-   model, weight_files                          the network; files that hold weights
+   cli                  the pi05-geometry command
+   study                experiments: tasks x arms x training seeds x conditions
+   inspect              pictures of a checkpoint, and the time of an action chunk
+   planner              memory of training and inference, predicted without a GPU
+   sim                  simulated RGB-D robots: Meta-World, LIBERO
+   robot                calibration and rigs of real robots
+   serving              a policy served over a network
+   checkpoint           checkpoints loaded, merged and converted
+   precompute           Depth Anything 3's features of a dataset, computed once
+   modeling_, processor_, configuration_    LeRobot's entry points: the policy, its processors, its settings
+   inference            an action chunk, fast
+   training             optimisers, dropout, micro-batches, LoRA, FSDP units
+   data                 images, prompts, tokenizers, relative actions, checks of data and statistics
+   geometry             from an observation to geometry tokens
+   model                the network
+   weight_files         files that hold weights
+   compat               differences between LeRobot's versions
 ```
 
 Imports run downwards only. Importing this package registers the policy types `pi05_geometry` and `pi05_geometry_remote`, the
-processor steps and the environment types `metaworld_rgbd` and `libero_rgbd` with LeRobot, which imports it by itself because
-of its name.
+processor steps and the environment types `metaworld_rgbd` and `libero_rgbd` with LeRobot. LeRobot imports every installed
+package whose name starts with `lerobot_policy_`.
 """
 
 from typing import TYPE_CHECKING, Any

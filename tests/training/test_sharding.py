@@ -45,9 +45,10 @@ def batch_of(step: int) -> dict:
     return batch
 
 
-def test_the_units_are_known_by_the_names_of_their_classes():
+@pytest.mark.parametrize("tokens", ["statistics", "points"])
+def test_the_units_are_known_by_the_names_of_their_classes(tokens):
     """LeRobot 0.6.2 wraps by class name; `fsdp_units` by type. Both have to find the same modules."""
-    policy = make_policy(geometry_expert="own")
+    policy = make_policy(geometry_expert="own", geometry_tokens=tokens)
     inner = {
         id(m) for unit in fsdp_units(policy) for m in unit.modules() if type(m).__name__ in policy._fsdp_wrap_modules
     }

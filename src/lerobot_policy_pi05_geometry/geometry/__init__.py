@@ -7,7 +7,7 @@
 
    keys                 names of observations and cameras
    depth                raw depth of any layout and unit -> metres and valid pixels
-   camera               one camera's calibration, point maps, rigid transforms
+   camera               depth -> 3-D points; one camera's calibration, rigid transforms
    calibration          the calibration file               dataset_calibration   where a dataset keeps it
    images               RGB of any layout -> (B, 3, H, W)
    source               the interface of a source: observation -> features
@@ -18,8 +18,8 @@
    adapter              features -> tokens, trainable      encoder               source + adapter, and cameras that fail
 ```
 
-V cameras, G = grid x grid cells per camera. A cell with no valid measurement is masked, never zero; an absent camera is
-left out of attention, never shown as black frames.
+V cameras, G = grid x grid cells per camera. A cell with no valid measurement is masked, and an absent
+camera is left out of attention instead of being shown as black frames.
 """
 
 from .calibration import read_calibration_file

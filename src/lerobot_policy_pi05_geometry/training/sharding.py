@@ -23,6 +23,7 @@ UNIT_CLASSES = (
     "Float32Linear",
     "GeometryGate",
     "GeometryAdapter",
+    "PointAdapter",
 )
 
 
