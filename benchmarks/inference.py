@@ -79,9 +79,9 @@ class CompiledGraphs(GraphRunner):
         super().__init__(network)
         self._compiled = torch.compile(run_layers, dynamic=False, fullgraph=True)
 
-    def _run(self, segment, embs, frame, cache, flow_time, output):
+    def _run(self, segment, embs, frame, cache, modulations, output):
         x, layers = embs.to(self.config.dtype), self._layers[segment]
-        return self._compiled(x, layers, self.config.expert, frame, cache, cache.span(segment), flow_time, output)
+        return self._compiled(x, layers, self.config.expert, frame, cache, cache.span(segment), modulations, output)
 
 
 def synchronise(device: str) -> None:

@@ -29,9 +29,9 @@ class FlowTime(NamedTuple):
     shift: Tensor
     gate: Tensor
 
-    def of_norm(self, index: int) -> Modulation:
-        """The modulation of one norm."""
-        return Modulation(self.scale[index], self.shift[index], self.gate[index])
+    def by_norm(self) -> list[Modulation]:
+        """The modulation of every norm."""
+        return [Modulation(*parts) for parts in zip(*(stacked.unbind() for stacked in self), strict=True)]
 
 
 class SegmentFrame(NamedTuple):
@@ -54,18 +54,16 @@ def run_layers(
     frame: SegmentFrame,
     cache: SegmentKVCache,
     span: slice,
-    flow_time: FlowTime | None,
+    modulations: Sequence[Modulation] | None,
     output: bool,
 ) -> Tensor:
     """x (B, N, W) through all layers, keys and values into the cache; without `output` the last layer stops after them.
 
-    span: the segment's columns in the cache. flow_time: None for plain norms. variant: sizes of the expert; the VLM has the same
-    heads.
+    span: the segment's columns in the cache. modulations: of the norms, as in `FlowTime`; None for plain norms. variant: sizes of
+    the expert; the VLM has the same heads.
     """
     for index, weights in enumerate(layers):
-        before_attention, before_mlp = (
-            (None, None) if flow_time is None else (flow_time.of_norm(2 * index), flow_time.of_norm(2 * index + 1))
-        )
+        before_attention, before_mlp = (None, None) if modulations is None else modulations[2 * index : 2 * index + 2]
         keys, values = cache.keys[index], cache.values[index]
         keys_only = not output and index == len(layers) - 1
         normed = _norm(x, weights.norm, before_attention)

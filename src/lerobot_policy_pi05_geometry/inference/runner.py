@@ -61,6 +61,13 @@ class GeometryPass(NamedTuple):
     frame: SegmentFrame
 
 
+class PreparedFlowTime(NamedTuple):
+    """The modulations at one flow time, stacked and by norm."""
+
+    flow_time: FlowTime
+    modulations: list[Modulation]
+
+
 class ChunkSettings(NamedTuple):
     """Numbers that a chunk depends on. geometry_tokens: wherever they stand. lengths: of the geometry segment and the suffix."""
 
@@ -98,7 +105,7 @@ class ChunkRunner:
             if id(model) not in fused:
                 fused[id(model)] = fuse(model, self.config.dtype)
         self._layers = {segment: fused[id(model)] for segment, model in self._models.items()}
-        self._flow_times: dict[tuple[int, tuple[float, ...]], list[FlowTime]] = {}
+        self._flow_times: dict[tuple[int, tuple[float, ...]], list[PreparedFlowTime]] = {}
         self._side = self.backend.new_side_stream()
         self._weights = WeightVersions(network)
 
@@ -109,7 +116,7 @@ class ChunkRunner:
     def tensors(self) -> list[Tensor]:
         """The tensors that outlive a chunk; some of them are the network's own storage (fused_weights.py)."""
         matrices = [m for layers in self._layers.values() for layer in layers for m in vars(layer).values()]
-        modulations = [tensor for times in self._flow_times.values() for time in times for tensor in time]
+        modulations = [tensor for times in self._flow_times.values() for time in times for tensor in time.flow_time]
         return [tensor for tensor in (*matrices, *modulations) if isinstance(tensor, Tensor)]
 
     # --- a chunk ------------------------------------------------------------------------------------------------------
@@ -219,7 +226,7 @@ class ChunkRunner:
         segment = self.network.embed_geometry(*geometry)
         given = GeometryPass(segment, self._frame([context.prefix_pad, segment.pad, None], Segment.GEOMETRY))
         if not self.network.geometry_follows_time:
-            self._write_geometry(context, given, self._flow_times_of(Segment.GEOMETRY, (0.0,))[0])
+            self._write_geometry(context, given, self._flow_times_of(Segment.GEOMETRY, (0.0,))[0].modulations)
         return given
 
     def denoise_suffix(
@@ -239,22 +246,24 @@ class ChunkRunner:
         hard = previous if isinstance(previous, HardPrefix) else None
         clean = None if hard is None else self._flow_times_of(Segment.SUFFIX, (0.0,))[0]
         geometry_times = self._flow_times_of(Segment.GEOMETRY, times) if network.geometry_follows_time else None
-        for step, flow_time in enumerate(self._flow_times_of(Segment.SUFFIX, times)):
+        for step, prepared in enumerate(self._flow_times_of(Segment.SUFFIX, times)):
+            modulations = prepared.modulations
             if geometry is not None and geometry_times is not None:
-                self._write_geometry(context, geometry, geometry_times[step])
+                self._write_geometry(context, geometry, geometry_times[step].modulations)
             if hard is not None and clean is not None:
-                x_t, flow_time = hard.impose(x_t), _by_token(hard.mask, clean, flow_time)
+                x_t = hard.impose(x_t)
+                modulations = _by_token(hard.mask, clean.flow_time, prepared.flow_time).by_norm()
             embs = network.action_in_proj(x_t)
-            x = self._run(Segment.SUFFIX, embs, frame, context.cache, flow_time, output=True)
-            velocity = network.action_out_proj(flow_time.of_norm(-1).norm(x))
+            x = self._run(Segment.SUFFIX, embs, frame, context.cache, modulations, output=True)
+            velocity = network.action_out_proj(modulations[-1].norm(x))
             if isinstance(previous, Guidance):
                 velocity = previous.correct(velocity, x_t, times[step], settings.max_guidance_weight)
             x_t = torch.add(x_t, velocity, alpha=dt)
         return x_t if hard is None else hard.impose(x_t)
 
-    def _write_geometry(self, context: Context, geometry: GeometryPass, flow_time: FlowTime) -> None:
+    def _write_geometry(self, context: Context, geometry: GeometryPass, modulations: Sequence[Modulation]) -> None:
         assert geometry.segment.embs is not None
-        self._run(Segment.GEOMETRY, geometry.segment.embs, geometry.frame, context.cache, flow_time, output=False)
+        self._run(Segment.GEOMETRY, geometry.segment.embs, geometry.frame, context.cache, modulations, output=False)
 
     def _run(
         self,
@@ -262,12 +271,12 @@ class ChunkRunner:
         embs: Tensor,
         frame: SegmentFrame,
         cache: SegmentKVCache,
-        flow_time: FlowTime | None,
+        modulations: Sequence[Modulation] | None,
         output: bool,
     ) -> Tensor:
         """Embeddings (B, N, W) of a segment through its layers, in the compute dtype."""
         x, layers = embs.to(self.config.dtype), self._layers[segment]
-        return run_layers(x, layers, self.config.expert, frame, cache, cache.span(segment), flow_time, output)
+        return run_layers(x, layers, self.config.expert, frame, cache, cache.span(segment), modulations, output)
 
     # --- the same in every chunk --------------------------------------------------------------------------------------
 
@@ -282,7 +291,7 @@ class ChunkRunner:
 
     @torch.inference_mode(False)
     @torch.no_grad()
-    def _flow_times_of(self, segment: Segment, times: tuple[float, ...]) -> list[FlowTime]:
+    def _flow_times_of(self, segment: Segment, times: tuple[float, ...]) -> list[PreparedFlowTime]:
         """The modulations of a segment's norms at these T flow times."""
         model = self._models[segment]
         key = id(model), times
@@ -294,7 +303,8 @@ class ChunkRunner:
             given = torch.stack([norm.dense(cond) for norm in (*norms, model.norm)], dim=1)  # (T, norms, 3 W)
             scale, shift, gate = Modulation.of(given)
             gate = gate.to(self.config.dtype)
-            self._flow_times[key] = [FlowTime(*rows) for rows in zip(scale, shift, gate, strict=True)]
+            found = [FlowTime(*rows) for rows in zip(scale, shift, gate, strict=True)]
+            self._flow_times[key] = [PreparedFlowTime(flow_time, flow_time.by_norm()) for flow_time in found]
         return self._flow_times[key]
 
     # --- the same in every layer --------------------------------------------------------------------------------------
