@@ -18,6 +18,16 @@ def check_choices(config: "PI05GeometryConfig", choices: Mapping[str, tuple[str,
             raise ValueError(f"--policy.{name} must be one of {', '.join(known)}, got {getattr(config, name)!r}.")
 
 
+def check_tokens(config: "PI05GeometryConfig") -> None:
+    """Raise ValueError for a kind of tokens that the geometry source does not have."""
+    belongs = {"points": ("rgbd", "none"), "rays": ("da3", "features", "none")}.get(config.geometry_tokens)
+    if belongs is not None and config.geometry_source not in belongs:
+        raise ValueError(
+            f"geometry_tokens={config.geometry_tokens} belongs to geometry_source={' or '.join(belongs[:-1])}, but this is "
+            f"{config.geometry_source}; leave geometry_tokens=statistics."
+        )
+
+
 def check_numbers(config: "PI05GeometryConfig") -> None:
     """Raise ValueError for a number that is out of its range."""
     for name in ("chunk_size", "n_action_steps", "num_inference_steps", "geometry_grid", "flow_samples"):

@@ -11,7 +11,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from .configuration_checks import check_choices, check_dropout, check_numbers, rtc_mode
+from .configuration_checks import check_choices, check_dropout, check_numbers, check_tokens, rtc_mode
 from .data.small_tokenizer import SMALL_TOKENIZER
 from .data.tokenizer import PALIGEMMA_TOKENIZER
 from .geometry.calibration import Rig
@@ -68,7 +68,7 @@ _CHOICES = {
     "geometry_positions": get_args(GeometryPositions),
     "geometry_placement": get_args(GeometryPlacement),
     "geometry_expert": get_args(GeometryExpert),
-    "geometry_tokens": ("statistics", "points"),
+    "geometry_tokens": ("statistics", "points", "rays"),
     "padded_actions": ("masked", "supervised"),
 }
 
@@ -218,6 +218,7 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
         if self.geometry_source == "da3" and self.da3_encoder is None:
             self.da3_encoder = DEFAULT_ENCODER
         check_numbers(self)
+        check_tokens(self)
         check_dropout(self)
         rtc_mode(self)
         self.network()  # names variants that do not belong together

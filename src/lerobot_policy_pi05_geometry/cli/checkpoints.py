@@ -94,7 +94,7 @@ def convert(
     geometry_expert: Annotated[str | None, typer.Option(help="shared, or own: a copy of the action expert.")] = None,
     geometry_tokens: Annotated[
         str | None,
-        typer.Option(help="Of depth: statistics of a cell's points, or points, pooled by a learned network."),
+        typer.Option(help="statistics; of depth also points (learned pooling); of da3 also rays (camera rays beside)."),
     ] = None,
     geometry_gate_openness: Annotated[
         float | None, typer.Option(help="Of the gate at the start: 1e-7 is shut, 1 open.")

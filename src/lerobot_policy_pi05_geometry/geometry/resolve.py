@@ -24,6 +24,7 @@ from .rays import RaySource
 from .rgbd import RgbdSource, depth_features
 from .source import GeometrySource
 from .unknown_cameras import UnknownCameras
+from .with_rays import WithRays
 
 if TYPE_CHECKING:
     from ..configuration_pi05_geometry import PI05GeometryConfig
@@ -66,13 +67,20 @@ def _resolve_from_rgb(config: "PI05GeometryConfig", dataset_meta: Any | None, en
         changes["geometry_pending"] = 0
     elif config.geometry_pending and dataset_meta is None:
         encoder = load_da3(config) if encoder is None else encoder
-        return Resolved(UnknownCameras(_pending(config), config.geometry_grid, encoder.variant.feature_dim), {})
+        rays = RAY_FEATURES if config.geometry_tokens == "rays" else 0
+        return Resolved(UnknownCameras(_pending(config), config.geometry_grid, encoder.variant.feature_dim + rays), {})
     if config.geometry_source == "features" and dataset_meta is not None:
         found = _resolve_store(config, Path(dataset_meta.root))
-        return Resolved(found.source, found.changes | changes)
-    source = _da3_source(config, encoder)
-    content = source.encoder.content_hash
-    return Resolved(source, changes if content is None else changes | {"da3_hash": content})
+    else:
+        source = _da3_source(config, encoder)
+        content = source.encoder.content_hash
+        found = Resolved(source, {} if content is None else {"da3_hash": content})
+    if config.geometry_tokens == "rays":
+        rays_found = _resolve_rays(config, dataset_meta)
+        assert found.source is not None
+        assert isinstance(rays_found.source, RaySource)
+        found = Resolved(WithRays(found.source, rays_found.source), found.changes | rays_found.changes)
+    return Resolved(found.source, found.changes | changes)
 
 
 def _resolve_depth(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Resolved:
@@ -140,7 +148,7 @@ def _resolve_rays(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Res
         raise ValueError("geometry_source=rays needs RGB cameras, but the data has none; use geometry_source=none.")
     if config.geometry_frame != "base":
         raise ValueError(
-            "geometry_source=rays describes where the camera stands in the robot's base frame; leave geometry_frame=base."
+            "Camera rays describe where the camera stands in the robot's base frame; leave geometry_frame=base."
         )
     recorded, rigs = _calibrated(config, dataset_meta, list(keys))
     moving = [camera for camera in keys if any(rig.cameras[camera].mount is not None for rig in rigs.values())]

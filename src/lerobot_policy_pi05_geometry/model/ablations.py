@@ -16,7 +16,8 @@ class AblationSettings:
     geometry_time: str = "clean"  # flow time that conditions geometry: clean (cached) or denoise (recomputed each step)
     geometry_placement: str = "segment"  # a segment of its own, or inside the VLM's prefix
     geometry_expert: str = "shared"  # the action expert's weights, or an expert of its own
-    # What a depth cell's token is computed from: statistics of its points, or sampled points, pooled by a learned network.
+    # What a token is computed from. statistics: of a depth cell's points, or DA3's features. points: a depth cell's points,
+    # pooled by a learned network. rays: DA3's features beside the cell's camera ray in the base frame (needs calibration).
     geometry_tokens: str = "statistics"
 
 

@@ -21,6 +21,7 @@ from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..geometry.da3 import Da3Backbone, Da3Encoder, Da3Source, Da3Variant
 from ..geometry.da3.encoder import store_products_in
 from ..geometry.keys import is_geometry_key
+from ..geometry.with_rays import WithRays
 from ..model.precision import DTYPES
 from ..training.micro_batches import rows_of, sum_of
 from .acting import CountedSampler, Target
@@ -130,6 +131,7 @@ class FakePolicy:
 
     def _encoder(self) -> Da3Encoder | None:
         source = None if self.policy.geometry is None else self.policy.geometry.source
+        source = source.source if isinstance(source, WithRays) else source
         return source.encoder if isinstance(source, Da3Source) else None
 
     # --- found by running -------------------------------------------------------------------------------------------

@@ -24,8 +24,8 @@ class GeometryStart:
     source: as in the configuration, rgbd by default. cameras: names in token order; by default those of the source's
     configuration, or one camera whose name the training data tells. calibration: a calibration file, or None if the training
     data has it. grid, frame, expert: as in the configuration; an own expert starts as a copy of the action expert. openness: of
-    the gate, see `SHUT`. encoder: Depth Anything 3, for da3 and features: hub id, folder or safetensors file. tokens: what a
-    depth cell's token is computed from, statistics or points.
+    the gate, see `SHUT`. encoder: Depth Anything 3, for da3 and features: hub id, folder or safetensors file. tokens: what
+    tokens are computed from: statistics, points (of depth) or rays (beside Depth Anything 3).
     """
 
     source: str | None = None

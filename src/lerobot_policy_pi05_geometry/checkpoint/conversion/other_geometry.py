@@ -101,7 +101,8 @@ def _plan(before: PI05GeometryConfig, start: GeometryStart, features_from_data: 
     after.geometry_grid = start.grid or before.geometry_grid
     after.geometry_frame = start.frame or before.geometry_frame
     after.geometry_expert = start.expert or before.geometry_expert
-    after.geometry_tokens = start.tokens or before.geometry_tokens
+    same_kind = (after.geometry_source in _DA3) == (before.geometry_source in _DA3)
+    after.geometry_tokens = start.tokens or (before.geometry_tokens if same_kind else "statistics")
     start.calibrate(after)
     if features_from_data:
         after.input_features, after.output_features, after.optional_cameras = {}, {}, {}
@@ -169,7 +170,7 @@ def _all_cameras(config: PI05GeometryConfig, source: str) -> list[str]:
 def _meaning(config: PI05GeometryConfig) -> tuple[str | None, ...]:
     """What decides what features mean, and so whether an adapter goes on reading them."""
     if config.geometry_source in _DA3:
-        return "da3", config.da3_hash
+        return "da3", config.da3_hash, config.geometry_tokens
     if config.geometry_source == "rgbd":
         return "rgbd", config.geometry_frame, config.geometry_tokens
     return (config.geometry_source,)
