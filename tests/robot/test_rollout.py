@@ -41,14 +41,17 @@ def world():
         patch.setattr(so_follower, "FeetechMotorsBus", MotorBus)
         patch.setattr(camera_realsense, "rs", make_pyrealsense2(made))
         patch.setattr(camera_realsense, "require_package", lambda *_, **__: None)
-        # A frame may be 500 ms old; on a machine that is busy with other things, the cameras' clock runs slower.
-        slow = SimpleNamespace(perf_counter=lambda: time.perf_counter() / 100, time=time.time, sleep=time.sleep)
+        # A frame may be 500 ms old, and warming up takes `warmup_s`; on a machine that is busy with other things, the cameras'
+        # clock runs slower for the one and faster for the other.
+        slow = SimpleNamespace(
+            perf_counter=lambda: time.perf_counter() / 100, time=lambda: 100 * time.time(), sleep=time.sleep
+        )
         patch.setattr(camera_realsense, "time", slow)
         yield made
 
 
 def cameras_option() -> str:
-    settings = f"width: {WIDTH}, height: {HEIGHT}, fps: 30, use_depth: true"
+    settings = f"width: {WIDTH}, height: {HEIGHT}, fps: 30, use_depth: true, warmup_s: 30"
     return (
         f"{{front: {{type: intelrealsense, serial_number_or_name: '111', {settings}}}, "
         f"wrist: {{type: intelrealsense, serial_number_or_name: '222', {settings}}}}}"
@@ -82,7 +85,7 @@ def dataset(world, tmp_path_factory) -> Path:
     from lerobot.robots.so_follower import SO101FollowerConfig
     from lerobot.robots.so_follower.so_follower import SOFollower
 
-    shape = {"width": WIDTH, "height": HEIGHT, "fps": 30, "use_depth": True}
+    shape = {"width": WIDTH, "height": HEIGHT, "fps": 30, "use_depth": True, "warmup_s": 30}
     cameras = {
         name: RealSenseCameraConfig(serial_number_or_name=serial, **shape)
         for serial, name in (("111", "front"), ("222", "wrist"))
