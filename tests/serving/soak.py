@@ -214,7 +214,8 @@ def soak(seconds: float, robots: int, fault: float, rate: float, side: int) -> d
         "wrong_chunks": wrong, "lost_connections": lost, "faults": done,
         "p50_ms": statistics.median(ranked), "p95_ms": ranked[int(0.95 * len(ranked))],
         "overhead_p50_ms": statistics.median(overheads), "overhead_p95_ms": overheads[int(0.95 * len(overheads))],
-        "memory_mib": [[round(part[0], 1), round(part[-1], 1)] for part in memory if part],
+        # Of every life of the server: after a third of it, when robots are back, and at its end.
+        "memory_mib": [[round(part[len(part) // 3], 1), round(part[-1], 1)] for part in memory if part],
         "tracebacks": log.count("Traceback"),
     }  # fmt: skip
 
