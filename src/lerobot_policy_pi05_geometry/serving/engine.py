@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
-from lerobot.policies.rtc.relative import reanchor_relative_rtc_prefix
-from lerobot.processor import NormalizerProcessorStep, RelativeActionsProcessorStep
 from torch import Tensor
 
 from ..checkpoint.load import LoadedPolicy
@@ -24,14 +22,13 @@ class Job(NamedTuple):
     """A request with what its session adds.
 
     noise: (S, max_action_dim). begins: the first of an episode. left_over: what of the session's last chunk was not executed,
-    normalised, (T, A), and absolute as it was sent; None without guidance.
+    normalised, (T, A); None without guidance.
     """
 
     request: Request
     noise: Tensor
     begins: bool
     left_over: Tensor | None = None
-    absolute: Tensor | None = None
 
     @property
     def group(self) -> tuple:
@@ -63,12 +60,12 @@ def make_job(session: Session, request: Request, seed: int, shape: tuple[int, in
         noise = request_noise(seed, session.name, session.requests, shape)
     else:
         noise = torch.from_numpy(np.array(request.noise))  # a copy: the frame's own memory cannot be written to
-    left_over = absolute = None
-    if request.guidance is not None and session.chunk is not None and session.absolute is not None:
+    left_over = None
+    if request.guidance is not None and session.chunk is not None:
         executed = request.guidance.executed_steps
         if executed < len(session.chunk):  # else nothing is left to continue
-            left_over, absolute = session.chunk[executed:], session.absolute[executed:]
-    return Job(request, noise, session.begins, left_over, absolute)
+            left_over = session.chunk[executed:]
+    return Job(request, noise, session.begins, left_over)
 
 
 def note_answer(session: Session, request: Request, answer: Answer) -> None:
@@ -76,7 +73,7 @@ def note_answer(session: Session, request: Request, answer: Answer) -> None:
     session.requests += 1
     session.begins = False
     session.seen.update(key for key in request.observation if is_geometry_key(key))
-    session.chunk, session.absolute = answer.chunk, torch.from_numpy(answer.actions)
+    session.chunk = answer.chunk
 
 
 class PolicyEngine:
@@ -88,9 +85,6 @@ class PolicyEngine:
         self._preprocess, self._postprocess = loaded.preprocess, loaded.postprocess
         self._guidance = guidance or self.config.rtc_config or RTCConfig()
         self._set_guidance(None)
-        steps = getattr(loaded.preprocess, "steps", ())
-        self._relative = next((s for s in steps if isinstance(s, RelativeActionsProcessorStep) and s.enabled), None)
-        self._normalizer = next((s for s in steps if isinstance(s, NormalizerProcessorStep)), None)
 
     @property
     def noise_shape(self) -> tuple[int, int]:
@@ -136,7 +130,11 @@ class PolicyEngine:
             return
         self._set_guidance(guidance)
         try:
-            yield {"inference_delay": guidance.inference_delay, "prev_chunk_left_over": self._left_over(jobs)}
+            left_over = torch.stack([job.left_over for job in jobs if job.left_over is not None])  # (B, T, A)
+            yield {
+                "inference_delay": guidance.inference_delay,
+                "prev_chunk_left_over": left_over.to(self.config.device),
+            }
         finally:
             self._set_guidance(None)
 
@@ -151,15 +149,6 @@ class PolicyEngine:
                 prefix_attention_schedule=given.prefix_attention_schedule or default.prefix_attention_schedule,
             )
         self.policy.init_rtc_processor()
-
-    def _left_over(self, jobs: Sequence[Job]) -> Tensor:
-        """(B, T, A) normalised. Relative actions are relative to a state that has changed since, so they are computed anew."""
-        if self._relative is None:
-            return torch.stack([job.left_over for job in jobs if job.left_over is not None]).to(self.config.device)
-        state = self._relative.get_cached_state()
-        assert state is not None  # the preprocessor has just seen it
-        absolute = torch.stack([job.absolute for job in jobs if job.absolute is not None])
-        return reanchor_relative_rtc_prefix(absolute, state, self._relative, self._normalizer, str(self.config.device))
 
 
 def collate(requests: Sequence[Request]) -> dict[str, Any]:

@@ -20,10 +20,9 @@ class Session:
     episode: int = 0
     begins: bool = True  # whether the next request is the first of an episode
     seen: set[str] = field(default_factory=set)  # keys of geometry that it has sent
-    chunk: Tensor | None = None  # the last, normalised: (S, D) on the CPU
-    absolute: Tensor | None = None  # and as it was sent: (S, A)
+    chunk: Tensor | None = None  # the last, normalised: (S, A) on the CPU
 
     def reset(self) -> None:
         """A new episode: the next chunk continues none."""
         self.episode += 1
-        self.begins, self.chunk, self.absolute = True, None, None
+        self.begins, self.chunk = True, None
