@@ -10,6 +10,8 @@ from .world import World
 MAX_WIDTH = 0.074  # metres between the open fingers, with some room
 BELOW_TOP = 0.022  # of the grip site; the palm begins 24 mm above it
 ABOVE_BOTTOM = 0.0135  # of the grip site; fingertips reach 13 mm below it
+SHALLOW = 0.010  # metres that a rim is grasped higher where the palm has no room
+COLLISION = 5.0  # cost of a sample point inside an obstacle; a radian of turning costs 2
 RIM = 0.008  # of the rim's middle inside the outer radius, metres
 # Fingers and palm as boxes about the grip site, metres: closing axis, across, up from the tips; measured in the model.
 _FINGER = np.array([[0.030, -0.014, -0.013], [0.068, 0.014, 0.050]])
@@ -59,8 +61,10 @@ def grasps(world: World, name: str, hand: Hand) -> list[Grasp]:
         radius = min(high[0] - low[0], high[1] - low[1]) / 2 - RIM
         # A hand nearer to the bowl's middle needs less room outside; the fingers then draw the bowl along.
         for radial in (radius, radius - 0.018) if by_rim else (0.0,):
-            site = np.array([*(centre[:2] + radial * closing[:2]), height])
-            cost = 1.0 * _collisions(site, rotation, obstacles) + 2.0 * hand.angle_from_home(rotation)
-            cost += 1.0 * (by_rim and radial < radius)
-            found.append(Grasp(site - origin, rotation, cost))
+            # A shallow grasp keeps the palm above what stands around the bowl.
+            for raised in (0.0, SHALLOW) if by_rim else (0.0,):
+                site = np.array([*(centre[:2] + radial * closing[:2]), height + raised])
+                cost = COLLISION * _collisions(site, rotation, obstacles) + 2.0 * hand.angle_from_home(rotation)
+                cost += 1.0 * (by_rim and radial < radius) + 0.5 * (raised > 0)
+                found.append(Grasp(site - origin, rotation, cost))
     return sorted(found, key=lambda grasp: grasp.cost)
