@@ -73,6 +73,20 @@ def test_a_point_that_was_not_measured_reaches_nothing(seed) -> None:
     assert found[0][0].isfinite().all()
 
 
+@pytest.mark.parametrize("known", [1, 5, COUNT])
+def test_a_cell_is_its_measured_points(known) -> None:
+    """Those that were not measured take no part in the maximum: the token is that of the others alone."""
+    features = cells(2).unflatten(3, (COUNT, 4)).clone()
+    features[..., 3] = 1.0
+    features[..., known:, :] = 0.0
+    for seed in range(3):
+        together, alone = (
+            adapter(seed).embed(features.flatten(3)),
+            adapter(seed).embed(features[..., :known, :].flatten(3)),
+        )
+        torch.testing.assert_close(together, alone, rtol=0, atol=1e-5)
+
+
 def test_every_measured_point_matters() -> None:
     """Moving the farthest one moves the token; what statistics of a cell would smooth over is there."""
     features = cells(1)
