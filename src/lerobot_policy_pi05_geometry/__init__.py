@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 from .configuration_pi05_geometry import PI05GeometryConfig
 from .data.normaliser_scale import NormaliserProbeStep, NormaliserScaleStep
 from .data.prompt import PromptProcessorStep
+from .data.raw_state import RawStateProcessorStep
 from .data.state_width import StateWidthStep
 from .data.tokenizer import PortableTokenizerProcessorStep
 from .serving.remote.configuration_pi05_geometry_remote import PI05GeometryRemoteConfig
@@ -50,6 +51,7 @@ __all__ = [
     "PI05GeometryRemoteConfig",
     "PortableTokenizerProcessorStep",
     "PromptProcessorStep",
+    "RawStateProcessorStep",
     "StateWidthStep",
     "__version__",
 ]
