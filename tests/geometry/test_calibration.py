@@ -13,7 +13,8 @@ from lerobot_policy_pi05_geometry.geometry.calibration import (
     read_calibration_file,
     write_calibration_file,
 )
-from lerobot_policy_pi05_geometry.geometry.camera import ColorStream, Mount, transform, unproject
+from lerobot_policy_pi05_geometry.geometry.camera import ColorStream, Mount
+from lerobot_policy_pi05_geometry.geometry.point_map import transform, unproject
 from tests.geometry.arms import so101_like
 from tests.geometry.scenes import calibrated, generator, random_pose
 

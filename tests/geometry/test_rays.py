@@ -5,8 +5,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, transform, unproject
+from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
 from lerobot_policy_pi05_geometry.geometry.keys import extrinsics_key
+from lerobot_policy_pi05_geometry.geometry.point_map import transform, unproject
 from lerobot_policy_pi05_geometry.geometry.rays import RaySource
 from tests.geometry.scenes import generator, random_pose, seeds, uniform
 

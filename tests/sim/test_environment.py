@@ -13,8 +13,8 @@ from lerobot.envs import preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_policy_pi05_geometry.data.quantiles import write_frame_quantiles
-from lerobot_policy_pi05_geometry.geometry.camera import transform, unproject
 from lerobot_policy_pi05_geometry.geometry.dataset_calibration import read_dataset_calibration
+from lerobot_policy_pi05_geometry.geometry.point_map import transform, unproject
 from lerobot_policy_pi05_geometry.geometry.rigid import check_rigid
 from lerobot_policy_pi05_geometry.sim.cameras import CAMERA_RANGES, LOOK_AT
 from lerobot_policy_pi05_geometry.sim.configuration import MetaworldRgbdEnv

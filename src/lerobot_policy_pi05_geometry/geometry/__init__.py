@@ -7,7 +7,7 @@
 
    keys                 names of observations and cameras
    depth                raw depth of any layout and unit -> metres and valid pixels
-   camera               depth -> 3-D points; one camera's calibration, rigid transforms
+   camera               one camera's calibration           point_map   depth -> 3-D points
    calibration          the calibration file               dataset_calibration   where a dataset keeps it
    images               RGB of any layout -> (B, 3, H, W)
    source               the interface of a source: observation -> features

@@ -1,4 +1,4 @@
-"""Pinhole cameras: calibration, depth to points, rigid transforms.
+"""Pinhole cameras: their calibration (point_map.py makes points of their depth).
 
 Axes are OpenCV's: x right, y down, z forward along the optical axis. Pixel (0, 0) has its centre at (0, 0). Extrinsics
 are `base_T_camera`: they map points from the camera into the robot's base frame, in metres.
@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from .rigid import as_matrix
 
@@ -158,44 +157,3 @@ def _check_intrinsics(intrinsics: list[float], size: list[int], what: str) -> No
         raise ValueError(f"Intrinsics of {what} are singular: fx and fy must be above 0, got {fx} and {fy}.")
     if len(size) != 2 or min(size) < 1:
         raise ValueError(f"Size of {what} must be [width, height] in pixels, got {size}.")
-
-
-def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
-    """Depth to points in the camera frame.
-
-    depth: (B, 1, H, W) metres along the optical axis. intrinsics: (4,) or (B, 4), fx, fy, cx, cy for this image size.
-    Returns (B, 3, H, W) metres: x = (u - cx) z / fx, y = (v - cy) z / fy, z.
-    """
-    height, width = depth.shape[-2:]
-    v = torch.arange(height, device=depth.device, dtype=depth.dtype)[:, None]
-    u = torch.arange(width, device=depth.device, dtype=depth.dtype)[None, :]
-    fx, fy, cx, cy = intrinsics.to(depth).unbind(-1)
-    fx, fy, cx, cy = (value.reshape(-1, 1, 1, 1) for value in (fx, fy, cx, cy))
-    return torch.cat([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], dim=1)
-
-
-def as_pose(pose: Tensor, key: str) -> Tensor:
-    """A pose as it stands in a batch -> (4, 4) for the whole batch, or (B, 4, 4).
-
-    Datasets store a pose as 16 numbers, row by row: LeRobot's tools cannot edit columns of more than one dimension.
-    Environments, and datasets of earlier versions of this package, give 4 x 4.
-    """
-    if pose.shape[-1:] == (16,):
-        return pose.unflatten(-1, (4, 4))
-    if pose.shape[-2:] == (4, 4):
-        return pose
-    raise ValueError(
-        f"{key} must be base_T_camera, as 16 numbers row by row or as 4 x 4, got shape {tuple(pose.shape)}."
-    )
-
-
-def transform(pose: Tensor, points: Tensor) -> Tensor:
-    """Map points (B, 3, H, W) through poses (4, 4) or (B, 4, 4).
-
-    Written as products of numbers and not as a matrix product: `allow_tf32`, which lerobot-train sets, rounds the factors
-    of matrix products to 10 bits, and a point 1 m away would move by up to 0.9 mm.
-    """
-    pose = pose.to(points).expand(points.shape[0], 4, 4)[..., None, None]  # (B, 4, 4, 1, 1)
-    x, y, z = points[:, 0:1], points[:, 1:2], points[:, 2:3]  # (B, 1, H, W)
-    moved = torch.addcmul(pose[:, :3, 3], pose[:, :3, 0], x)
-    return moved.addcmul_(pose[:, :3, 1], y).addcmul_(pose[:, :3, 2], z)

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from .camera import CameraCalibration, as_pose
+from .camera import CameraCalibration
 from .keys import batch_like, extrinsics_key
+from .point_map import as_pose
 from .rgbd import WAVELENGTHS
 from .rigid import check_rigid
 from .source import GeometryFeatures, GeometrySource

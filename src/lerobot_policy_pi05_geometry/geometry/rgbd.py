@@ -11,10 +11,10 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from .camera import as_pose, transform, unproject
 from .depth import check_measured, check_unit, to_metres
 from .keys import RAW_STATE, depth_key, extrinsics_key, find_depth_key
 from .placed_camera import PlacedCamera
+from .point_map import as_pose, transform, unproject
 from .rigid import check_rigid
 from .source import GeometryFeatures, GeometrySource
 

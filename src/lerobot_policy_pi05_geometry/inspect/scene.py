@@ -10,11 +10,11 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from ..geometry.calibration import Rig
-from ..geometry.camera import transform, unproject
 from ..geometry.depth import to_metres
 from ..geometry.keys import RAW_STATE, depth_key
 from ..geometry.kinematics import ForwardKinematics
 from ..geometry.placed_camera import PlacedCamera
+from ..geometry.point_map import transform, unproject
 
 matplotlib.use("Agg")
 

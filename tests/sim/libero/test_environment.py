@@ -8,8 +8,8 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import preprocess_observation
 
-from lerobot_policy_pi05_geometry.geometry.camera import transform, unproject
 from lerobot_policy_pi05_geometry.geometry.dataset_calibration import read_dataset_calibration
+from lerobot_policy_pi05_geometry.geometry.point_map import transform, unproject
 from lerobot_policy_pi05_geometry.sim.libero.cameras import CameraMove
 
 pytestmark = pytest.mark.libero

@@ -8,7 +8,8 @@ import torch.nn.functional as F  # noqa: N812
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, transform, unproject
+from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
+from lerobot_policy_pi05_geometry.geometry.point_map import transform, unproject
 from lerobot_policy_pi05_geometry.geometry.rigid import check_rigid
 from tests.geometry.scenes import calibrated, generator, project, random_pose, seeds, uniform
 
