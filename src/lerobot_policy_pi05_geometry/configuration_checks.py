@@ -1,5 +1,6 @@
-"""Checks of the configuration's values: each raises ValueError with one sentence that names the setting."""
+"""Checks of the configuration's values. What cannot be raises ValueError with one sentence that names the setting."""
 
+import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, get_args
 
@@ -9,6 +10,8 @@ from .model.config import RtcMode
 
 if TYPE_CHECKING:
     from .configuration_pi05_geometry import PI05GeometryConfig
+
+logger = logging.getLogger(__name__)
 
 
 def check_choices(config: "PI05GeometryConfig", choices: Mapping[str, tuple[str, ...]]) -> None:
@@ -97,3 +100,14 @@ def rtc_mode(config: "PI05GeometryConfig") -> RtcMode:
     if mode == "trained" and not config.rtc_training_max_delay:
         raise ValueError("rtc_mode=trained needs a policy that was trained with rtc_training_max_delay above 0.")
     return mode  # type: ignore[return-value]
+
+
+def warn_of_random_weights(config: "PI05GeometryConfig") -> None:
+    """Warn of a policy of the released size that starts without pretraining."""
+    if config.paligemma_variant == "gemma_2b":
+        logger.warning(
+            "THIS POLICY STARTS FROM RANDOM WEIGHTS: its paligemma_variant=gemma_2b has 2.9 billion parameters and no "
+            "pretraining, and will not learn from a robot's dataset. Convert a π0.5 (`pi05-geometry convert "
+            "lerobot/pi05_base OUTPUT`) and train it by --policy.path=OUTPUT; or use the small size, which can be trained "
+            "from scratch (--policy.paligemma_variant=small --policy.action_expert_variant=small)."
+        )

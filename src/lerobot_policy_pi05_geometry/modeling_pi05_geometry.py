@@ -27,7 +27,7 @@ from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LAN
 from torch import Tensor, nn
 
 from .compat import make_rtc_processor
-from .configuration_checks import refuse_log_gate, rtc_mode
+from .configuration_checks import refuse_log_gate, rtc_mode, warn_of_random_weights
 from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
 from .data.images import ImageRangeCheck, prepare_images
 from .data.relative_actions import anchor_of, relative_to
@@ -40,9 +40,9 @@ from .geometry.da3 import Da3Encoder
 from .geometry.da3.weights import load_da3
 from .geometry.keys import camera_of
 from .geometry.resolve import resolve
-from .inference.cuda_graphs import PROMPT_STEP
 from .inference.sampler import ChunkSampler
 from .inference.side_stream import PendingGeometry
+from .inference.warm_up import ChunkShapes, warm_up
 from .model import PI05Pytorch
 from .model.config import RunnerName
 from .model.flow_matching import FlowDraw, draw_flow
@@ -52,6 +52,7 @@ from .training.dropout import Cameras, drop
 from .training.lora import always_in_full, peft_targets
 from .training.micro_batches import each_of, require_whole_parameters, rows_of, sum_of
 from .training.parameter_groups import UpdateSize, new_parameters, parameter_groups
+from .training.progress import TrainingProgress
 from .training.sharding import UNIT_CLASSES
 from .weight_files.files import find_file, require_policy_type
 from .weight_files.strict_load import load_strictly
@@ -60,18 +61,6 @@ logger = logging.getLogger(__name__)
 
 _SHARE_EVERY = 20  # training steps between two measurements of the attention that actions give to geometry
 _EVALUATION_STEP = -1  # The evaluation loss draws the same noise at every training step, so that values are comparable.
-
-
-class TrainingProgress(nn.Module):
-    """The number of optimiser steps done. It is saved in the checkpoint: noise is keyed by it (model/flow_matching.py).
-
-    It is a module, since PEFT saves modules only.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.step: Tensor
-        self.register_buffer("step", torch.zeros((), dtype=torch.int64))
 
 
 class PI05GeometryPolicy(PreTrainedPolicy):
@@ -121,7 +110,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self._last_share: Tensor | None = None
         self.image_range = ImageRangeCheck()
         if not self.model.action_in_proj.weight.is_meta:  # Meta tensors get their values in from_pretrained.
-            self._warn_of_random_weights()
+            warn_of_random_weights(config)
             self.to(config.device)
         self.reset()
 
@@ -132,15 +121,6 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if all(key.startswith(EMPTY_CAMERA) for key in self.config.image_features):
             network.paligemma.model.vision_tower.requires_grad_(False)
             network.paligemma.model.multi_modal_projector.requires_grad_(False)
-
-    def _warn_of_random_weights(self) -> None:
-        if self.config.paligemma_variant == "gemma_2b":
-            logger.warning(
-                "THIS POLICY STARTS FROM RANDOM WEIGHTS: its paligemma_variant=gemma_2b has 2.9 billion parameters and no "
-                "pretraining, and will not learn from a robot's dataset. Convert a π0.5 (`pi05-geometry convert "
-                "lerobot/pi05_base OUTPUT`) and train it by --policy.path=OUTPUT; or use the small size, which can be trained "
-                "from scratch (--policy.paligemma_variant=small --policy.action_expert_variant=small)."
-            )
 
     @classmethod
     def from_pretrained(
@@ -349,31 +329,24 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if self._acted_on and not self.training:
             self.warm_up()
 
-    @torch.no_grad()
     def warm_up(self, batch_size: int | None = None) -> None:
         """Prepare for episodes of so many robots (as many as acted last, at first one): no chunk then waits for a preparation.
 
         Where chunks are recorded (on a GPU), one is recorded for every length that a prompt can have. `reset` calls this from the
         second episode on; call it after loading for a fast first one. It changes no action and draws no random number.
         """
-        config, device, batch_size = self.config, self.training_step.device, batch_size or self._acted_on or 1
-        runner = cast(RunnerName, config.inference_runner)
-        if not self.sampler.records(runner):
-            self.sampler.prepare(runner)
-            return
-        side, geometry = config.image_resolution[0], None
-        if self.geometry is not None:
-            tokens = self.geometry.source.num_tokens
-            embs = torch.zeros(batch_size, tokens, self.model.geometry_width, device=device)
-            blank = GeometryTokens(embs, torch.zeros(batch_size, tokens, dtype=torch.bool, device=device))
-            geometry = PendingGeometry(tokens, lambda: blank)
-        images = [torch.zeros(batch_size, 3, side, side, device=device) for _ in config.image_features]
-        present = [torch.ones(batch_size, dtype=torch.bool, device=device) for _ in images]
-        noise = torch.zeros(batch_size, config.chunk_size, config.max_action_dim, device=device)
-        for length in range(PROMPT_STEP, config.tokenizer_max_length + PROMPT_STEP, PROMPT_STEP):
-            text = torch.zeros(batch_size, length, dtype=torch.int64, device=device)
-            there = torch.ones_like(text, dtype=torch.bool)
-            self.sampler(images, present, text, there, noise=noise, geometry=geometry, runner=runner)
+        config = self.config
+        shapes = ChunkShapes(
+            batch=batch_size or self._acted_on or 1,
+            cameras=len(config.image_features),
+            side=config.image_resolution[0],
+            geometry_tokens=0 if self.geometry is None else self.geometry.source.num_tokens,
+            geometry_width=self.model.geometry_width,
+            longest_prompt=config.tokenizer_max_length,
+            steps=config.chunk_size,
+            action_dim=config.max_action_dim,
+        )
+        warm_up(self.sampler, cast(RunnerName, config.inference_runner), shapes, self.training_step.device)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

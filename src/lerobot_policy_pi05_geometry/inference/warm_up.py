@@ -1,0 +1,50 @@
+"""Chunks of every shape that a policy meets, recorded before the first one is needed.
+
+Where chunks are recorded (on a GPU), every length that a prompt can have needs a recording of its own. Made in the middle of an
+episode, it would hold the robot up.
+"""
+
+from typing import NamedTuple
+
+import torch
+
+from ..model.config import RunnerName
+from ..model.segments import GeometryTokens
+from .cuda_graphs import PROMPT_STEP
+from .sampler import ChunkSampler
+from .side_stream import PendingGeometry
+
+
+class ChunkShapes(NamedTuple):
+    """Shapes of a chunk's inputs: images (batch, 3, side, side) of so many cameras, geometry (batch, tokens, width),
+    prompts of at most longest_prompt tokens, noise (batch, steps, action_dim). geometry_tokens: 0 without geometry.
+    """
+
+    batch: int
+    cameras: int
+    side: int
+    geometry_tokens: int
+    geometry_width: int
+    longest_prompt: int
+    steps: int
+    action_dim: int
+
+
+@torch.no_grad()
+def warm_up(sampler: ChunkSampler, runner: RunnerName, shapes: ChunkShapes, device: torch.device) -> None:
+    """Build the runner; where it records chunks, record one of every prompt length. Draws no random number."""
+    if not sampler.records(runner):
+        sampler.prepare(runner)
+        return
+    batch, geometry = shapes.batch, None
+    if shapes.geometry_tokens:
+        embs = torch.zeros(batch, shapes.geometry_tokens, shapes.geometry_width, device=device)
+        blank = GeometryTokens(embs, torch.zeros(batch, shapes.geometry_tokens, dtype=torch.bool, device=device))
+        geometry = PendingGeometry(shapes.geometry_tokens, lambda: blank)
+    images = [torch.zeros(batch, 3, shapes.side, shapes.side, device=device) for _ in range(shapes.cameras)]
+    present = [torch.ones(batch, dtype=torch.bool, device=device) for _ in images]
+    noise = torch.zeros(batch, shapes.steps, shapes.action_dim, device=device)
+    for length in range(PROMPT_STEP, shapes.longest_prompt + PROMPT_STEP, PROMPT_STEP):
+        text = torch.zeros(batch, length, dtype=torch.int64, device=device)
+        mask = torch.ones_like(text, dtype=torch.bool)
+        sampler(images, present, text, mask, noise=noise, geometry=geometry, runner=runner)
