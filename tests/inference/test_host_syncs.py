@@ -43,7 +43,7 @@ class WithoutStreams(Backend):
 @pytest.fixture
 def fake(monkeypatch) -> FakeTensorMode:
     monkeypatch.setattr(fused_weights, "_already_joined", lambda weights: None)
-    arriving = encoder._CameraStatus(torch.ones(2, dtype=torch.bool), None, set())  # what was seen before
+    arriving = encoder._CameraStatus(torch.ones(1, 2, dtype=torch.bool), None, set())  # what was seen before
     monkeypatch.setattr(encoder._CameraStatus, "of", lambda alive, missing: arriving)
     return FakeTensorMode(allow_non_fake_inputs=True)
 
@@ -83,7 +83,7 @@ def test_no_value_is_asked_for_and_nothing_copied(fake, changes) -> None:
         batch, noise = on_gpu(fake, batch), on_gpu(fake, noise)
         policy.image_range._done = True  # the first observation of an episode is looked into
         if policy.geometry is not None:
-            policy.geometry._checked = True
+            policy.geometry._checked = {0}
         if "absent_cameras" in changes:
             batch = without(batch, WRIST)
         policy.predict_action_chunk(batch, noise=noise, runner="eager")

@@ -64,23 +64,24 @@ def exact(size: int = 1, seed: int = 0) -> dict:
 def test_it_acts_as_the_local_policy_does_bit_for_bit():
     """With noise drawn here, as a local policy draws it; over chunks and episodes, through LeRobot's processors."""
     loaded = load()
-    local, served = copy.deepcopy(loaded.policy), loaded
-    with serving(real_server(served)) as running:
+    local = copy.deepcopy(loaded.policy)
+
+    def two_episodes(policy, act) -> torch.Tensor:
+        torch.manual_seed(0)
+        found = []
+        for episode in range(2):
+            policy.reset()
+            found += [act(exact(seed=10 * episode + step)) for step in range(6)]
+        return torch.stack(found)
+
+    # Before the server starts: both use the same tokenizer, which serves one thread at a time.
+    expected = two_episodes(local, lambda o: loaded.postprocess(local.select_action(loaded.preprocess(o))))
+    with serving(real_server(loaded)) as running:
         policy = remote(running.url, noise="client")
         before, after = make_pre_post_processors(policy.config)
-        actions = []
-        for act in (
-            lambda o: loaded.postprocess(local.select_action(loaded.preprocess(o))),
-            lambda o: after(policy.select_action(before(o))),
-        ):
-            torch.manual_seed(0)
-            found = []
-            for episode in range(2):
-                (policy if actions else local).reset()
-                found += [act(exact(seed=10 * episode + step)) for step in range(6)]
-            actions.append(torch.stack(found))
-    assert actions[0].shape == (12, 1, ACTION_DIM)
-    assert torch.equal(actions[0], actions[1])
+        found = two_episodes(policy, lambda o: after(policy.select_action(before(o))))
+    assert expected.shape == (12, 1, ACTION_DIM)
+    assert torch.equal(expected, found)
 
 
 def test_rows_are_robots_with_sessions_of_their_own():

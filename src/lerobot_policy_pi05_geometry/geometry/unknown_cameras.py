@@ -23,6 +23,7 @@ class UnknownCameras(GeometrySource):
     def __init__(self, cameras: tuple[str, ...], grid: int, feature_dim: int = FEATURE_DIM, points: int = 0) -> None:
         super().__init__()
         self.cameras, self.grid, self.feature_dim, self.points = cameras, grid, feature_dim, points
+        self.optional = frozenset(cameras)  # none of them is there, and none has failed
         self._warned = False
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
