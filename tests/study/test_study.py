@@ -108,6 +108,7 @@ def test_the_warm_start_study_end_to_end(tmp_path):
     assert "0.0 core-hours if every arm" in printed
 
 
+@pytest.mark.long
 def test_a_study_killed_at_any_point_gives_the_same_table(short, short_table, tmp_path):
     """Killed with its workers in training, then in evaluation; each time started again in the same folder."""
     runs = runs_of(read_spec(short), tmp_path)

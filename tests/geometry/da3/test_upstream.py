@@ -114,7 +114,9 @@ IMAGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", IMAGES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name == "small" else pytest.mark.long) for name in IMAGES]
+)
 def test_features_equal_upstreams(packages, tmp_path, name):
     variant = VARIANTS[name]
     assert_equal_features(packages, tmp_path, variant, REGISTRY[name], IMAGES[name])
