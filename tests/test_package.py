@@ -62,6 +62,13 @@ def test_imports_run_one_way():
             assert layer_of(imported) <= layer_of(own), f"{path.relative_to(SRC)} imports {imported}, a layer above it"
 
 
+def test_mujoco_is_imported_from_one_place():
+    """MuJoCo selects its OpenGL on its first import; sim/headless.py makes that EGL, without which nothing renders."""
+    first_import = re.compile(r"^\s*(import mujoco$|from mujoco import)", re.MULTILINE)
+    files = [*SRC.rglob("*.py"), *(ROOT / "tests" / "robot").rglob("*.py")]
+    assert [file.name for file in files if first_import.search(file.read_text())] == ["headless.py"]
+
+
 def test_the_policy_is_exported_and_the_plugin_scan_does_not_load_it():
     script = (
         "import sys, lerobot_policy_pi05_geometry as p; "

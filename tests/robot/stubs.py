@@ -12,9 +12,9 @@ from collections.abc import Callable
 from contextlib import contextmanager
 from types import SimpleNamespace
 
-import mujoco
 import numpy as np
 
+from lerobot_policy_pi05_geometry.sim.headless import mujoco
 from tests.geometry.arms import JOINTS, mjcf_of, so101_like
 
 WIDTH, HEIGHT = 40, 32

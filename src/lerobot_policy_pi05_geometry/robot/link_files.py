@@ -94,7 +94,7 @@ def _urdf_link(name: str, parent: str, joint: ET.Element, joints: list[ET.Elemen
 def _read_mjcf(path: Path) -> list[Link]:
     """Bodies of an MJCF as MuJoCo itself reads them. A body of several joints gets a link per joint above it."""
     try:
-        import mujoco
+        from ..sim.headless import mujoco
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             "Reading an MJCF file needs MuJoCo; install it with `pip install 'lerobot_policy_pi05_geometry[sim]'`, or "
