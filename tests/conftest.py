@@ -18,4 +18,6 @@ settings.load_profile("repeatable")
 
 # Tiny networks spend their time in threads waiting for each other; LeRobot's own processes inherit the variable.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# MuJoCo selects its OpenGL on its first import, whichever test makes it; without a display only EGL renders.
+os.environ.setdefault("MUJOCO_GL", "egl")
 torch.set_num_threads(1)
