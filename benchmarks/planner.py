@@ -139,7 +139,8 @@ def measure(what: str, size: int, settings: dict[str, Any], gpu: bool) -> dict[s
     resident = high_water_mark()
     config = make_config(settings, gpu)
     config.pretrained_path = Path("nowhere")  # LoRA wants one to start from; nothing is read
-    policy = PI05GeometryPolicy(config)
+    with torch.device(config.device):  # drawing the released size's weights takes minutes on a CPU
+        policy = PI05GeometryPolicy(config)
     if "rank" in settings:
         policy.wrap_with_peft(peft_cli_overrides={"r": settings["rank"], "method_type": "LORA"})
     policy.train(what == TRAIN)
