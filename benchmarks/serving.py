@@ -80,7 +80,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         write_checkpoint(Path(folder) / "checkpoint", given.variant)
         loaded = load_policy(Path(folder) / "checkpoint")
-        command = ["-m", "lerobot_policy_pi05_geometry.cli", "serve", f"{folder}/checkpoint", "--port", "0"]
+        command = ["-m", "pi05_geometry_cli", "serve", f"{folder}/checkpoint", "--port", "0"]
         server = subprocess.Popen(
             [sys.executable, *command], stdout=subprocess.PIPE, text=True, env=os.environ | {"COLUMNS": "200"}
         )

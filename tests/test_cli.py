@@ -9,7 +9,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from lerobot_policy_pi05_geometry.cli import app
+from pi05_geometry_cli import app
 
 from .checkpoint.conversion.sources import folder_contents, write_lerobot
 
@@ -17,7 +17,7 @@ from .checkpoint.conversion.sources import folder_contents, write_lerobot
 def fail(*arguments: str) -> str:
     """Run `pi05-geometry`, which has to fail; returns what it printed."""
     result = subprocess.run(
-        [sys.executable, "-m", "lerobot_policy_pi05_geometry.cli", *arguments],
+        [sys.executable, "-m", "pi05_geometry_cli", *arguments],
         env=os.environ | {"HF_HUB_OFFLINE": "1", "COLUMNS": "200"},
         capture_output=True,
         text=True,

@@ -1,9 +1,11 @@
-"""The package as a whole: what it exports, which way its imports run, and that the README's Python runs."""
+"""The packages as a whole: what is exported, which way imports run, what `--help` loads, and that the README's Python runs."""
 
 import ast
+import json
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import torch
@@ -23,7 +25,6 @@ LAYERS = [
     {"checkpoint", "precompute"},
     {"inspect", "planner", "sim", "robot", "serving"},
     {"study"},
-    {"cli"},
 ]
 
 
@@ -60,6 +61,44 @@ def test_imports_run_one_way():
             continue
         for imported in imports_at_run_time(path):
             assert layer_of(imported) <= layer_of(own), f"{path.relative_to(SRC)} imports {imported}, a layer above it"
+
+
+def test_the_package_does_not_import_its_commands():
+    """pi05_geometry_cli stands above the package, and beside it: importing the package imports torch and LeRobot."""
+    assert not [path for path in SRC.rglob("*.py") if "pi05_geometry_cli" in path.read_text()]
+
+
+def test_help_imports_neither_torch_nor_lerobot():
+    """Of the command that pip installs, and of every subcommand but `train`, whose --help is lerobot-train's."""
+    [entry] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"].values()
+    module, _, function = entry.partition(":")
+    script = f"""
+import json, sys
+from importlib import import_module
+from typer.main import get_command
+
+def commands(command, path=()):
+    yield path
+    for name, inner in getattr(command, "commands", {{}}).items():
+        yield from commands(inner, (*path, name))
+
+main = getattr(import_module("{module}"), "{function}")
+helped = []
+for path in commands(get_command(import_module("pi05_geometry_cli").app)):
+    if path != ("train",):
+        sys.argv = ["pi05-geometry", *path, "--help"]
+        try:
+            main()
+        except SystemExit as exit:
+            assert not exit.code, path
+        helped.append(" ".join(path))
+sys.stderr.write(json.dumps([helped, sorted({{name.partition(".")[0] for name in sys.modules}})]))
+"""
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    helped, modules = json.loads(result.stderr)
+    assert {"", "study", "plan", "calibrate hand-eye", "serve"} <= set(helped)
+    slow = {"torch", "lerobot", "transformers", "numpy", "pandas", "matplotlib", "lerobot_policy_pi05_geometry"}
+    assert not slow & set(modules)
 
 
 def test_mujoco_is_imported_from_one_place():

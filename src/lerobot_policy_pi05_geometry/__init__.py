@@ -1,7 +1,6 @@
 """π0.5 with a geometry segment: a LeRobot policy plugin.
 
 ```
-   cli                  the pi05-geometry command
    study                experiments: tasks x arms x training seeds x conditions
    inspect              pictures of a checkpoint, and the time of an action chunk
    planner              memory of training and inference, predicted without a GPU
@@ -19,6 +18,8 @@
    weight_files         files that hold weights
    compat               differences between LeRobot's versions
 ```
+
+The `pi05-geometry` command stands beside this package in `src/`, so that its `--help` need not import it.
 
 Imports run downwards only. Importing this package registers the policy types `pi05_geometry` and `pi05_geometry_remote`, the
 processor steps and the environment types `metaworld_rgbd` and `libero_rgbd` with LeRobot. LeRobot imports every installed

@@ -15,7 +15,6 @@ from torch.utils.data import default_collate
 from typer.testing import CliRunner
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
-from lerobot_policy_pi05_geometry.cli import app
 from lerobot_policy_pi05_geometry.geometry.calibration import Rig, write_calibration_file
 from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
 from lerobot_policy_pi05_geometry.geometry.dataset_calibration import (
@@ -23,6 +22,7 @@ from lerobot_policy_pi05_geometry.geometry.dataset_calibration import (
     write_dataset_calibration,
 )
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
+from pi05_geometry_cli import app
 from tests.entry_points import chunk_of, make_config, redraw
 
 NAME, SIZE = "local/other-names", 28

@@ -7,10 +7,10 @@ import sys
 import pytest
 from typer.testing import CliRunner
 
-from lerobot_policy_pi05_geometry.cli import app
-from lerobot_policy_pi05_geometry.cli.app import console
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
 from lerobot_policy_pi05_geometry.planner.options import da3_variant
+from pi05_geometry_cli import app
+from pi05_geometry_cli.app import console
 
 TINY = ["--policy.paligemma_variant=tiny", "--policy.action_expert_variant=tiny", "--policy.image_resolution=[28,28]"]
 SHORT = ["--policy.gradient_checkpointing=true", "--policy.geometry_source=none"]
@@ -139,7 +139,7 @@ def test_the_released_size_without_its_memory():
     """
     program = (
         "import sys; sys.argv = ['pi05-geometry', 'plan', '--policy.gradient_checkpointing=true', '--batch_size=1'];"
-        "from lerobot_policy_pi05_geometry.cli import app; app(standalone_mode=False);"
+        "from pi05_geometry_cli import app; app(standalone_mode=False);"
         "print('HWM', next(l.split()[1] for l in open('/proc/self/status') if l.startswith('VmHWM')))"
     )
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=600)

@@ -10,7 +10,6 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from typer.testing import CliRunner
 
-from lerobot_policy_pi05_geometry.cli import app
 from lerobot_policy_pi05_geometry.geometry.calibration import Calibration, read_calibration_file, write_calibration_file
 from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, ColorStream, pose_of_sensor
 from lerobot_policy_pi05_geometry.geometry.kinematics import Arm, ForwardKinematics
@@ -19,6 +18,7 @@ from lerobot_policy_pi05_geometry.robot.board import Board
 from lerobot_policy_pi05_geometry.robot.calibrate import check_board_depth, image_stream, make_arm
 from lerobot_policy_pi05_geometry.robot.dataset_views import spread_out, still_frames
 from lerobot_policy_pi05_geometry.robot.link_files import read_links
+from pi05_geometry_cli import app
 from tests.geometry.arms import STATE_NAMES, URDF, mjcf_of, random_arm, random_state, so101_like
 from tests.geometry.scenes import generator, random_pose
 from tests.robot.recordings import BOARD, INTRINSICS, SIZE, Recording, aligned_errors, make_recording

@@ -45,7 +45,7 @@ def environment(*paths: Path, **more: str) -> dict[str, str]:
 @contextmanager
 def server_process(checkpoint: Path, *options: str, log: Path, **env: str) -> Iterator[tuple[int, subprocess.Popen]]:
     """`pi05-geometry serve` on a free port. Yields the port and the process; ends it by SIGTERM, which must work."""
-    command = [sys.executable, "-m", "lerobot_policy_pi05_geometry.cli", "serve", str(checkpoint), *options]
+    command = [sys.executable, "-m", "pi05_geometry_cli", "serve", str(checkpoint), *options]
     if "--port" not in options:
         command += ["--port", "0"]
     with log.open("w") as output:

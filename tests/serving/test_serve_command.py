@@ -3,8 +3,8 @@
 import pytest
 from typer.testing import CliRunner
 
-from lerobot_policy_pi05_geometry.cli import app
 from lerobot_policy_pi05_geometry.serving.extras import require_extra
+from pi05_geometry_cli import app
 
 MISTAKES = {
     "an open host": (["--host", "0.0.0.0"], "clients need a key"),

@@ -96,7 +96,7 @@ def test_a_study_of_a_dataset_end_to_end(root, tmp_path):
         "--policy.n_action_steps=4", "--batch_size=4",
     ]  # fmt: skip
     environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
-    command = [sys.executable, "-m", "lerobot_policy_pi05_geometry.cli", *arguments]
+    command = [sys.executable, "-m", "pi05_geometry_cli", *arguments]
     result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
     assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-2000:]
     page = (tmp_path / "report.html").read_text()

@@ -19,7 +19,7 @@ from lerobot_policy_pi05_geometry.study.spec import read_spec
 from lerobot_policy_pi05_geometry.study.training_log import read_curve, read_log_line
 
 pytestmark = [pytest.mark.train, pytest.mark.sim]
-CLI = [sys.executable, "-m", "lerobot_policy_pi05_geometry.cli"]
+CLI = [sys.executable, "-m", "pi05_geometry_cli"]
 ENVIRONMENT = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
 
 
@@ -165,7 +165,7 @@ def test_two_ranks_of_torchrun_share_the_runs(short, short_table, tmp_path):
     """Each rank its half, no run twice; the same table as from one process."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "-m"]
     arguments = [
-        "lerobot_policy_pi05_geometry.cli",
+        "pi05_geometry_cli",
         "study",
         "--spec",
         short,

@@ -36,7 +36,7 @@ def command(*arguments: str, fails: bool = False, **environment: str) -> str:
 
 
 def ours(*arguments: str, fails: bool = False, **environment: str) -> str:
-    return command("lerobot_policy_pi05_geometry.cli", *arguments, fails=fails, **environment)
+    return command("pi05_geometry_cli", *arguments, fails=fails, **environment)
 
 
 def training(root: Path, output: Path) -> list[str]:

@@ -27,7 +27,7 @@ def serve(
     fps: Annotated[float | None, typer.Option(help="With --lerobot: the robot's control rate; 30 by default.")] = None,
 ) -> None:
     """Serve a checkpoint to robots on other machines: openpi's websocket protocol, or LeRobot's gRPC protocol."""
-    from ..serving.extras import require_extra
+    from lerobot_policy_pi05_geometry.serving.extras import require_extra
 
     require_extra("serve", "websockets", "msgpack")
     sizes = None if batch_sizes is None else _sizes(batch_sizes)
@@ -35,7 +35,7 @@ def serve(
         require_extra("serve-lerobot", "grpc")
         if key_file is not None:
             raise ValueError("LeRobot's robot_client can send no key, so --key-file has no use with --lerobot.")
-        from ..serving.lerobot_wire.grpc_server import serve_lerobot
+        from lerobot_policy_pi05_geometry.serving.lerobot_wire.grpc_server import serve_lerobot
 
         console.print(f"Loading {checkpoint} ...")
         serve_lerobot(
@@ -45,7 +45,7 @@ def serve(
         return
     if fps is not None:
         raise ValueError("--fps is for --lerobot; openpi's clients space a chunk's actions themselves.")
-    from ..serving.service import serve_websocket
+    from lerobot_policy_pi05_geometry.serving.service import serve_websocket
 
     console.print(f"Loading {checkpoint} ...")
     serve_websocket(

@@ -1,5 +1,7 @@
 """The commands of `pi05-geometry`, one file per subject. Each command imports its implementation when it is called.
 
+This is a package of its own because importing `lerobot_policy_pi05_geometry` imports torch and LeRobot.
+
 ```
    app           the application, and options shared by several commands
    studies       demo, study                 simulation   record, train, evaluate

@@ -18,7 +18,7 @@ def inspect(
     output: Output = Path("inspect.html"),
 ) -> None:
     """Figures of a checkpoint on a dataset frame: attention mask, depth with grid cells, attention of the actions."""
-    from ..inspect.inspection import write_inspection
+    from lerobot_policy_pi05_geometry.inspect.inspection import write_inspection
 
     write_inspection(checkpoint, dataset_root, dataset_repo_id, frame, device, output)
     console.print(f"Open [bold]{output}[/bold]")
@@ -39,10 +39,10 @@ def bench(
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from rich.table import Table
 
-    from ..checkpoint.load import load_policy
-    from ..inspect.bench import bench as run
-    from ..inspect.bench import random_observation
-    from ..inspect.inspection import frame_batch
+    from lerobot_policy_pi05_geometry.checkpoint.load import load_policy
+    from lerobot_policy_pi05_geometry.inspect.bench import bench as run
+    from lerobot_policy_pi05_geometry.inspect.bench import random_observation
+    from lerobot_policy_pi05_geometry.inspect.inspection import frame_batch
 
     loaded = load_policy(checkpoint, device)
     if dataset_root is None:
@@ -122,8 +122,8 @@ def convert(
 
     A checkpoint of this policy gets another geometry: only what is named changes, all else stays as it is.
     """
-    from ..checkpoint.conversion import GeometryStart
-    from ..checkpoint.conversion import convert as run
+    from lerobot_policy_pi05_geometry.checkpoint.conversion import GeometryStart
+    from lerobot_policy_pi05_geometry.checkpoint.conversion import convert as run
 
     geometry = GeometryStart(
         source=geometry_source,
@@ -149,7 +149,7 @@ def export(
     output: Annotated[Path, typer.Argument(help="Folder to write; it must not be there.")],
 ) -> None:
     """The way back: write a checkpoint as LeRobot's own π0.5 (--policy.type=pi05), without its geometry."""
-    from ..checkpoint.conversion import export as run
+    from lerobot_policy_pi05_geometry.checkpoint.conversion import export as run
 
     run(checkpoint, output)
     console.print(f"LeRobot's π0.5 loads it: --policy.path={output}")
@@ -161,7 +161,7 @@ def merge(
     output: Annotated[Path, typer.Argument(help="Folder to write; it must not be there.")],
 ) -> None:
     """Fold LoRA into the weights: write a checkpoint that acts the same and needs neither PEFT nor its base."""
-    from ..checkpoint.merge import merge as run
+    from lerobot_policy_pi05_geometry.checkpoint.merge import merge as run
 
     run(checkpoint, output)
     console.print(f"Wrote [bold]{output}[/bold].")

@@ -27,7 +27,7 @@ def board(
     """Write the ChArUco board as a picture to print. Measure its squares afterwards: printers scale."""
     import cv2
 
-    from ..robot.board import Board
+    from lerobot_policy_pi05_geometry.robot.board import Board
 
     made = Board.parse(board)
     cv2.imwrite(str(output), made.picture())
@@ -51,8 +51,8 @@ def camera(
     """Read intrinsics, depth scale and the place of the colour stream from a connected RealSense."""
     from dataclasses import replace
 
-    from ..geometry.calibration import write_calibration_file
-    from ..robot.realsense import read_camera
+    from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
+    from lerobot_policy_pi05_geometry.robot.realsense import read_camera
 
     calibration = _read(file)
     found = read_camera(serial, width, height, fps, rotation % 360)
@@ -87,9 +87,9 @@ def arm(
 
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from ..geometry.calibration import write_calibration_file
-    from ..robot.calibrate import make_arm, state_names
-    from ..robot.link_files import read_links
+    from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
+    from lerobot_policy_pi05_geometry.robot.calibrate import make_arm, state_names
+    from lerobot_policy_pi05_geometry.robot.link_files import read_links
 
     pairs = [text.partition("=") for text in joint or []]
     if any(not sign or not entry for _, sign, entry in pairs):
@@ -131,11 +131,11 @@ def hand_eye(
     import numpy as np
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from ..geometry.calibration import write_calibration_file
-    from ..inspect.inspection import frame_batch
-    from ..inspect.scene import scene_figure, scene_of
-    from ..robot.board import Board
-    from ..robot.calibrate import calibrate_hand_eye
+    from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
+    from lerobot_policy_pi05_geometry.inspect.inspection import frame_batch
+    from lerobot_policy_pi05_geometry.inspect.scene import scene_figure, scene_of
+    from lerobot_policy_pi05_geometry.robot.board import Board
+    from lerobot_policy_pi05_geometry.robot.calibrate import calibrate_hand_eye
 
     changed, found = calibrate_hand_eye(
         dataset_root, dataset_repo_id, _read(file), camera, arm, link, Board.parse(board), not fixed
@@ -180,10 +180,10 @@ def scene(
     """What a calibration says: the points of all depth cameras in the base frame, with the arm's links drawn into them."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from ..geometry.calibration import read_calibration_file
-    from ..geometry.dataset_calibration import read_dataset_calibration
-    from ..inspect.inspection import frame_batch
-    from ..inspect.scene import log_to_rerun, scene_figure, scene_of
+    from lerobot_policy_pi05_geometry.geometry.calibration import read_calibration_file
+    from lerobot_policy_pi05_geometry.geometry.dataset_calibration import read_dataset_calibration
+    from lerobot_policy_pi05_geometry.inspect.inspection import frame_batch
+    from lerobot_policy_pi05_geometry.inspect.scene import log_to_rerun, scene_figure, scene_of
 
     dataset = LeRobotDataset(dataset_repo_id, root=dataset_root)
     calibration = read_dataset_calibration(dataset.meta, {}) if file is None else read_calibration_file(file)
@@ -199,6 +199,6 @@ def scene(
 
 
 def _read(file: Path):
-    from ..geometry.calibration import Calibration, read_calibration_file
+    from lerobot_policy_pi05_geometry.geometry.calibration import Calibration, read_calibration_file
 
     return read_calibration_file(file) if file.exists() else Calibration()

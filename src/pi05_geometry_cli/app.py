@@ -35,6 +35,6 @@ def progress_bars() -> Progress:
 
 
 def require_simulator() -> None:
-    from ..sim.configuration import require_simulator as require
+    from lerobot_policy_pi05_geometry.sim.configuration import require_simulator as require
 
     require()

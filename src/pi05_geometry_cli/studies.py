@@ -12,8 +12,8 @@ from rich.progress import Progress, TaskID
 from .app import Output, app, console, progress_bars, require_simulator
 
 if TYPE_CHECKING:
-    from ..study.launch import Progress as StudyProgress
-    from ..study.runs import Run
+    from lerobot_policy_pi05_geometry.study.launch import Progress as StudyProgress
+    from lerobot_policy_pi05_geometry.study.runs import Run
 
 Workers = Annotated[int | None, typer.Option(help="Runs at once. Default: one per core.")]
 
@@ -77,9 +77,9 @@ def study(
         command = f"pi05-geometry study --spec {name} --output {output}"
         path = _simulated_study(name, output, workers, retry_crashed, command)
     else:
-        from ..study.held_out import held_out_runs
-        from ..study.held_out_report import write_held_out_report
-        from ..study.launch import rank, wait_for
+        from lerobot_policy_pi05_geometry.study.held_out import held_out_runs
+        from lerobot_policy_pi05_geometry.study.held_out_report import write_held_out_report
+        from lerobot_policy_pi05_geometry.study.launch import rank, wait_for
 
         options = _forwarded(context.args)
         numbers = [int(seed) for seed in seeds.split(",")]
@@ -111,13 +111,13 @@ def _forwarded(arguments: list[str]) -> dict[str, str]:
 def _simulated_study(name: str, output: Path, workers: int | None, retry_crashed: bool, command: str) -> Path | None:
     """Execute this rank's share of a simulated study, phase by phase; rank 0 writes the report."""
     require_simulator()
-    from ..study.growth_report import write_growth_report
-    from ..study.launch import rank, wait_for
-    from ..study.plan import phases
-    from ..study.pretraining import PretrainingRun
-    from ..study.report import write_report
-    from ..study.simulated import SimulatedRun
-    from ..study.spec import read_spec
+    from lerobot_policy_pi05_geometry.study.growth_report import write_growth_report
+    from lerobot_policy_pi05_geometry.study.launch import rank, wait_for
+    from lerobot_policy_pi05_geometry.study.plan import phases
+    from lerobot_policy_pi05_geometry.study.pretraining import PretrainingRun
+    from lerobot_policy_pi05_geometry.study.report import write_report
+    from lerobot_policy_pi05_geometry.study.simulated import SimulatedRun
+    from lerobot_policy_pi05_geometry.study.spec import read_spec
 
     spec = read_spec(name)
     grows = len(spec.growth.multiples) > 1
@@ -138,8 +138,8 @@ def _simulated_study(name: str, output: Path, workers: int | None, retry_crashed
 
 
 def _print_estimate(name: str, output: Path) -> None:
-    from ..study.estimate import estimate, measure_costs
-    from ..study.spec import read_spec
+    from lerobot_policy_pi05_geometry.study.estimate import estimate, measure_costs
+    from lerobot_policy_pi05_geometry.study.spec import read_spec
 
     spec = read_spec(name)
     costs = measure_costs(spec.budget, spec.comparisons[0].tasks[0])
@@ -153,7 +153,7 @@ def _print_estimate(name: str, output: Path) -> None:
 
 
 def _execute(runs: "Sequence[Run]", workers: int | None, retry_crashed: bool) -> None:
-    from ..study.launch import default_workers, launch, share
+    from lerobot_policy_pi05_geometry.study.launch import default_workers, launch, share
 
     with progress_bars() as bars:
         launch(share(runs), workers or default_workers(), _study_progress(bars), retry_crashed)

@@ -21,7 +21,7 @@ def quantiles(
     ] = None,
 ) -> None:
     """Recompute a dataset's state quantiles over all frames (LeRobot averages those of single episodes)."""
-    from ..data.quantiles import write_frame_quantiles
+    from lerobot_policy_pi05_geometry.data.quantiles import write_frame_quantiles
 
     wanted: dict[str, list[int]] = {}
     for given in full_range or []:
@@ -41,8 +41,8 @@ def store_calibration(
     dataset_root: Annotated[Path, typer.Option("--dataset.root", help="Folder of a LeRobotDataset.")],
 ) -> None:
     """Store the calibration of cameras and arms in a dataset's meta/info.json, which LeRobot's editing tools keep."""
-    from ..geometry.calibration import read_calibration_file
-    from ..geometry.dataset_calibration import write_dataset_calibration
+    from lerobot_policy_pi05_geometry.geometry.calibration import read_calibration_file
+    from lerobot_policy_pi05_geometry.geometry.dataset_calibration import write_dataset_calibration
 
     found = read_calibration_file(calibration)
     write_dataset_calibration(dataset_root, found)
@@ -77,7 +77,7 @@ def precompute(
     Started again after an interruption, it continues. Several processes or machines that share the folder divide the frames
     when started with torchrun (`torchrun --nproc-per-node 4 --no-python pi05-geometry precompute ...`).
     """
-    from ..precompute.command import run_precompute
+    from lerobot_policy_pi05_geometry.precompute.command import run_precompute
 
     names = None if cameras is None else cameras.split(",")
     with Progress(

@@ -25,7 +25,7 @@ def libero_replay(
     limit: Annotated[int | None, typer.Option(help="Demonstrations of each file; none is all.")] = None,
 ) -> None:
     """Render LIBERO's original demonstrations anew, with depth and calibration, into a LeRobotDataset v3."""
-    from ..sim.libero.replay import replay
+    from lerobot_policy_pi05_geometry.sim.libero.replay import replay
 
     missing = [str(file) for file in files if not file.is_file()]
     if missing:
@@ -50,8 +50,8 @@ def libero_floors(
     episodes: Annotated[int, typer.Option(help="Episodes of the expert, and as many of the blind plan.")] = 50,
 ) -> None:
     """Measure how often the scripted expert succeeds, and how often a plan that never looks."""
-    from ..sim.libero.floors import measure, write_floors
-    from ..sim.libero.tasks import find_task, suite_tasks
+    from lerobot_policy_pi05_geometry.sim.libero.floors import measure, write_floors
+    from lerobot_policy_pi05_geometry.sim.libero.tasks import find_task, suite_tasks
 
     numbers = task_id or range(len(suite_tasks(suite)))
     with progress_bars() as bars:
@@ -71,7 +71,7 @@ def libero_report(
     placement: Placement = "stock",
 ) -> None:
     """Success per task of a lerobot-eval on LIBERO, with intervals and floors; written to report.md too."""
-    from ..sim.libero.report import read_results, report
+    from lerobot_policy_pi05_geometry.sim.libero.report import read_results, report
 
     text = report(read_results(folder, placement), placement)
     (folder / "report.md").write_text(text)

@@ -34,13 +34,13 @@ def record(
     repo_id, total = f"local/{output.name}", episodes
     if env == "metaworld_rgbd":
         require_simulator()
-        from ..sim.record import record as record_episodes
+        from lerobot_policy_pi05_geometry.sim.record import record as record_episodes
 
         attempts = record_episodes(output, repo_id, task, episodes, cameras, image_size, seed=seed)
     elif env == "libero_rgbd":
-        from ..sim.libero.environment import RgbdLiberoEnv
-        from ..sim.libero.record import record as record_libero
-        from ..sim.libero.tasks import suite_tasks
+        from lerobot_policy_pi05_geometry.sim.libero.environment import RgbdLiberoEnv
+        from lerobot_policy_pi05_geometry.sim.libero.record import record as record_libero
+        from lerobot_policy_pi05_geometry.sim.libero.tasks import suite_tasks
 
         environments = [
             RgbdLiberoEnv(task, number, cameras, placement, image_size=image_size, rendering=rendering)
@@ -63,7 +63,7 @@ def record(
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
 def train(context: typer.Context) -> None:
     """lerobot-train, with the same arguments, and decoded frames kept in memory. For small datasets of images."""
-    from ..study.frames_in_memory import train_in_memory
+    from lerobot_policy_pi05_geometry.study.frames_in_memory import train_in_memory
 
     sys.argv = ["lerobot-train", *context.args]  # LeRobot parses the command line itself
     train_in_memory()
@@ -85,9 +85,9 @@ def evaluate(
     import json
 
     require_simulator()
-    from ..checkpoint.load import load_policy
-    from ..sim.configuration import MetaworldRgbdEnv
-    from ..sim.evaluate import evaluate as run
+    from lerobot_policy_pi05_geometry.checkpoint.load import load_policy
+    from lerobot_policy_pi05_geometry.sim.configuration import MetaworldRgbdEnv
+    from lerobot_policy_pi05_geometry.sim.evaluate import evaluate as run
 
     environment = MetaworldRgbdEnv(task=task, cameras=cameras, sensor=sensor, image_size=image_size)
     loaded = load_policy(checkpoint, device, environment)

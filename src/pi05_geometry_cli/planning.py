@@ -35,7 +35,7 @@ def plan(
     before 8-bit AdamW; LoRA on VLM and expert; the action expert only; LoRA on the expert), each with the largest
     micro-batch. Options that you give are kept. Exit code 1 if nothing fits.
     """
-    from ..planner.command import Data, Wish, run
+    from lerobot_policy_pi05_geometry.planner.command import Data, Wish, run
 
     sizes = image_size.lower().split("x")
     if len(sizes) != 2 or not all(side.isdecimal() and int(side) > 0 for side in sizes):
