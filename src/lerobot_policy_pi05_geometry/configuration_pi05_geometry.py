@@ -17,6 +17,7 @@ from .data.tokenizer import PALIGEMMA_TOKENIZER
 from .geometry.calibration import Rig
 from .geometry.camera import CameraCalibration
 from .geometry.depth import METRES_PER_UNIT
+from .geometry.depth_augmentation import DepthAugmentation
 from .geometry.keys import (
     IMAGE_PREFIX,
     camera_of,
@@ -114,6 +115,8 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     camera_dropout: float = 0.0
     depth_unit: str = "mm"  # unit of the depth that arrives: mm (LeRobot's default) or m
     max_depth: float = 10.0  # metres; farther counts as not measured
+    # What training adds to depth: noise, holes, errors of scale and pose (geometry/depth_augmentation.py). Off.
+    depth_augmentation: DepthAugmentation = field(default_factory=DepthAugmentation)
     calibration_path: str | None = None  # JSON file; None: what the dataset carries (geometry/dataset_calibration.py)
     # Camera -> key of its depth. None is needed for observation.images.<camera>_depth, nor for a dataset's depth maps
     # that LeRobot flags as such: the policy finds them.
@@ -220,6 +223,7 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
         check_numbers(self)
         check_tokens(self)
         check_dropout(self)
+        self.depth_augmentation.check(self.geometry_source, self.geometry_frame)
         rtc_mode(self)
         self.network()  # names variants that do not belong together
 

@@ -38,7 +38,7 @@ from .data.training_batch import check_actions, require_finite_losses, valid_ste
 from .geometry import GeometryEncoder
 from .geometry.da3 import Da3Encoder
 from .geometry.da3.weights import load_da3
-from .geometry.keys import camera_of
+from .geometry.keys import AUGMENTATION_KEY, camera_of
 from .geometry.resolve import resolve
 from .inference.sampler import ChunkSampler
 from .inference.side_stream import PendingGeometry
@@ -264,6 +264,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         """Loss of every action entry (B, S, max_action_dim), the mean over flow samples."""
         device = self.training_step.device
         images, img_masks = prepare_images(batch, self.config, device)
+        if self.training and self.config.depth_augmentation:
+            batch = {**batch, AUGMENTATION_KEY: draw.key.to(device)}
         embs, pad = (None, None) if self.geometry is None else self._measure(batch)
         if self.training:
             img_masks, pad = drop(draw, self.config.dropout_rates, self._cameras(), img_masks, pad)

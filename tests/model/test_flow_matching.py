@@ -25,7 +25,7 @@ def same(a: FlowDraw, b: FlowDraw) -> bool:
 
 def nothing_shared(a: FlowDraw, b: FlowDraw) -> bool:
     """No number of one draw occurs anywhere in the other, so neither is a shifted copy."""
-    return not any(torch.isin(x, y).any() for x, y in zip(a, b, strict=True) if x.is_floating_point())
+    return not any(torch.isin(x, y).any() for x, y in zip(a, b, strict=True) if x is not a.delay)
 
 
 @given(seeds, steps, indices)
@@ -66,11 +66,11 @@ def test_the_batch_does_not_matter(members: list[int], random) -> None:
 
 
 def test_shapes_and_types() -> None:
-    """(B, S, D), and (B,) for the rest, all float32 but the delay."""
+    """(B, S, D), and (B,) for the rest, all float32 but delay and key."""
     drawn = draw(0, 0, [5, 6])
-    assert [tuple(x.shape) for x in drawn] == [(2, 4, 3), (2,), (2,), (2,), (2,)]
-    assert {x.dtype for x in drawn[:-1]} == {torch.float32}
-    assert drawn.delay.dtype == torch.int64
+    assert [tuple(x.shape) for x in drawn] == [(2, 4, 3), (2,), (2,), (2,), (2,), (2,)]
+    assert {x.dtype for x in drawn[:-2]} == {torch.float32}
+    assert drawn.delay.dtype == drawn.key.dtype == torch.int64
 
 
 @pytest.mark.parametrize("vary", ["step", "index"])
@@ -78,9 +78,9 @@ def test_distributions(vary: str) -> None:
     """Noise is standard normal, time is Beta(1.5, 1) in [0.001, 1], the rest uniform: over steps and over samples."""
     count = 4000
     if vary == "index":
-        noise, time, *uniform, _ = draw(3, 7, list(range(count)))
+        noise, time, *uniform, _, key = draw(3, 7, list(range(count)))
     else:
-        noise, time, *uniform, _ = (
+        noise, time, *uniform, _, key = (
             torch.cat(parts) for parts in zip(*(draw(3, step, [7]) for step in range(count)), strict=True)
         )
     assert abs(noise.mean()) < 0.02
@@ -90,7 +90,7 @@ def test_distributions(vary: str) -> None:
     # P(time <= t) = u^1.5 with u = (t - offset) / scale, for Beta(1.5, 1).
     for t in (0.1, 0.3, 0.5, 0.8):
         assert abs((time <= t).float().mean() - ((t - 0.001) / 0.999) ** 1.5) < 0.03
-    for drawn in uniform:
+    for drawn in (*uniform, key.double() / 2**62):
         assert 0 <= drawn.min() < 0.01
         assert 0.99 < drawn.max() < 1
         for p in (0.1, 0.5, 0.9):
@@ -99,9 +99,9 @@ def test_distributions(vary: str) -> None:
 
 def test_the_draws_are_independent() -> None:
     """No two of the draws of a sample are correlated, and neither are those of two steps."""
-    noise, *rest, delay = draw(4, 0, list(range(4000)))
+    noise, *rest, delay, key = draw(4, 0, list(range(4000)))
     later = draw(4, 1, list(range(4000))).noise
-    columns = torch.stack([noise[:, 0, 0], noise[:, 1, 0], later[:, 0, 0], *rest, delay.float()])
+    columns = torch.stack([noise[:, 0, 0], noise[:, 1, 0], later[:, 0, 0], *rest, delay.float(), key / 2**62])
     correlation = torch.corrcoef(columns) - torch.eye(len(columns))
     assert correlation.abs().max() < 0.06
 
@@ -109,7 +109,7 @@ def test_the_draws_are_independent() -> None:
 def test_several_flow_samples() -> None:
     """K noises and times per observation, no two alike, and one of the other draws; keyed like a single one."""
     drawn = draw_flow(0, 0, [5, 6], SHAPE, **BETA, samples=3)
-    assert [tuple(x.shape) for x in drawn] == [(2, 3, 4, 3), (2, 3), (2,), (2,), (2,)]
+    assert [tuple(x.shape) for x in drawn] == [(2, 3, 4, 3), (2, 3), (2,), (2,), (2,), (2,)]
     noise, time, *_ = drawn
     assert len(noise.unique()) == noise.numel()
     assert len(time.unique()) == time.numel()

@@ -16,7 +16,7 @@ NAMES = ("front", "wrist", "left", "right")
 
 def draws(u: torch.Tensor, which: torch.Tensor) -> FlowDraw:
     nothing = torch.zeros(len(u))
-    return FlowDraw(nothing, nothing, u, which, nothing)
+    return FlowDraw(nothing, nothing, u, which, nothing, nothing)
 
 
 @st.composite

@@ -15,6 +15,8 @@ IMAGE_PREFIX = "observation.images."
 CALIBRATION_PREFIX = "observation.calibration."
 _OBSERVATION_PREFIX = "observation."
 RAW_STATE = "observation.raw_state"  # the state before normalisation, which forward kinematics needs
+# What a training sample's depth augmentation is drawn from, (B,) int64. The policy adds it to training batches alone.
+AUGMENTATION_KEY = "augmentation_key"
 RIG = f"{CALIBRATION_PREFIX}rig"  # which rig a frame of merged data is from, (B,) or (B, 1)
 
 

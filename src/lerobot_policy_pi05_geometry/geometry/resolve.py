@@ -131,6 +131,7 @@ def _resolve_depth(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Re
         bounds={camera: (low, high) for camera, (low, high) in bounds.items()},
         optional=config.optional_depth_cameras,
         as_points=config.geometry_tokens == "points",
+        augmentation=config.depth_augmentation,
     )
     return Resolved(source, changes)
 

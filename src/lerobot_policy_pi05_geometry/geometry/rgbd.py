@@ -12,7 +12,8 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 from .depth import check_measured, check_unit, to_metres
-from .keys import RAW_STATE, depth_key, extrinsics_key, find_depth_key
+from .depth_augmentation import DepthAugmentation, augment_depth, jittered
+from .keys import AUGMENTATION_KEY, RAW_STATE, depth_key, extrinsics_key, find_depth_key
 from .placed_camera import PlacedCamera
 from .point_map import as_pose, transform, unproject
 from .rigid import check_rigid
@@ -31,7 +32,7 @@ class RgbdSource(GeometrySource):
     placed: the cameras in token order. sizes: (H, W) of each camera's depth. base_frame: points in the robot's base instead of
     the camera. unit, max_depth, bounds (by camera): see `depth.to_metres`. depth_keys: see `keys.find_depth_key`.
     optional: cameras
-    that any observation may lack.
+    that any observation may lack. augmentation: of training batches that have `AUGMENTATION_KEY`.
     Sources: Fourier features as in NeRF (Mildenhall et al., 2020), with wavelengths in metres.
     """
 
@@ -47,6 +48,7 @@ class RgbdSource(GeometrySource):
         bounds: Mapping[str, tuple[float, float]] | None = None,
         optional: Iterable[str] = (),
         as_points: bool = False,
+        augmentation: DepthAugmentation | None = None,
     ) -> None:
         super().__init__()
         self.cameras, self.grid = tuple(camera.name for camera in placed), grid
@@ -55,6 +57,7 @@ class RgbdSource(GeometrySource):
         self.feature_dim, self.points = depth_features(as_points)
         self.sizes, self.base_frame, self.unit, self.max_depth = dict(sizes), base_frame, unit, max_depth
         self.depth_keys = dict(depth_keys or {})
+        self.augmentation = augmentation or DepthAugmentation()
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
         return [
@@ -116,9 +119,16 @@ class RgbdSource(GeometrySource):
             check_unit(raw, key, self.unit, factor, bounds)
             if self.training and camera not in self.optional:
                 check_measured(raw, key)
+        drawn = batch[AUGMENTATION_KEY].to(raw.device) if self.training and AUGMENTATION_KEY in batch else None
+        number = self.cameras.index(camera)
+        if drawn is not None:
+            depth, valid = augment_depth(self.augmentation, depth, valid, drawn, number, self.max_depth)
         points = unproject(depth, placed.intrinsics(rows, depth.device))
         if self.base_frame:
-            points = transform(self._pose(camera, batch, rows, depth.device, check), points)
+            pose = self._pose(camera, batch, rows, depth.device, check)
+            if drawn is not None:
+                pose = jittered(self.augmentation, pose, drawn, number)
+            points = transform(pose, points)
         valid = valid & points.isfinite().all(dim=1, keepdim=True)  # with a pose of NaN no point is known
         return cell_points(points, valid, self.grid) if self.points else cell_statistics(points, valid, self.grid)
 

@@ -25,6 +25,7 @@ class FlowDraw(NamedTuple):
     dropout: Tensor  # (B,) float32, uniform in [0, 1): which inputs are masked (training/dropout.py)
     camera: Tensor  # (B,) float32, uniform in [0, 1): which camera, if one camera is masked
     delay: Tensor  # (B,) int64 in [0, max_delay]: action steps of the hard prefix (real_time_chunking.py)
+    key: Tensor  # (B,) int64 of 62 bits: of what is drawn on the device (geometry/depth_augmentation.py)
 
 
 def draw_flow(
@@ -40,7 +41,7 @@ def draw_flow(
     samples: int = 1,
     max_delay: int = 0,
 ) -> FlowDraw:
-    """Draw noise, flow time Beta(alpha, beta) * scale + offset, two uniform numbers and a delay for each dataset index.
+    """Draw noise, flow time Beta(alpha, beta) * scale + offset, two uniform numbers, a delay and a key for each dataset index.
 
     seed: of the run. step: optimiser steps done so far. indices: dataset index of each of the B samples.
     shape: (S, D) of one action chunk. samples: K, noises and times per observation. max_delay: of the hard prefix.
@@ -48,7 +49,7 @@ def draw_flow(
     """
     noise: list[np.ndarray] = []
     time: list[np.ndarray] = []
-    dropout, camera, delay = [], [], []
+    dropout, camera, delay, key = [], [], [], []
     for index in indices:
         generator = np.random.Generator(
             np.random.Philox(
@@ -60,6 +61,7 @@ def draw_flow(
         time.append(generator.beta(alpha, beta, samples) * scale + offset)
         dropout.append(generator.random())
         camera.append(generator.random())
+        key.append(generator.integers(0, 1 << 62))
         delay.append(generator.integers(0, max_delay, endpoint=True))
     noises, times = torch.from_numpy(np.stack(noise)), torch.from_numpy(np.stack(time)).float()
     if samples == 1:
@@ -70,4 +72,5 @@ def draw_flow(
         torch.tensor(dropout, dtype=torch.float32),
         torch.tensor(camera, dtype=torch.float32),
         torch.tensor(delay),
+        torch.tensor(key),
     )

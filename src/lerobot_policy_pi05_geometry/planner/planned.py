@@ -72,7 +72,9 @@ class PlannedPolicy(PI05GeometryPolicy):
         samples = () if self.config.flow_samples == 1 else (self.config.flow_samples,)
         noise = torch.zeros(size, *samples, steps, self.config.max_action_dim)
         zeros = torch.zeros(size)
-        draw = FlowDraw(noise, torch.zeros(size, *samples), dropout=zeros, camera=zeros, delay=zeros.long())
+        draw = FlowDraw(
+            noise, torch.zeros(size, *samples), dropout=zeros, camera=zeros, delay=zeros.long(), key=zeros.long()
+        )
         losses = self._losses(batch, draw)[..., : self.config.action_feature.shape[0]]
         valid = torch.ones(losses.shape[:2], dtype=torch.bool)
         return losses.masked_fill(~valid[..., None], 0.0).sum() / (whole * losses[0].numel())
