@@ -57,8 +57,9 @@ def uninitialised() -> Iterator[None]:
 @torch.no_grad()
 def fill(network: torch.nn.Module) -> None:
     """Random weights, quickly: large tensors repeat a random block."""
-    block = 0.02 * torch.randn(1 << 20, generator=torch.Generator().manual_seed(0))
+    drawn = 0.02 * torch.randn(1 << 20, generator=torch.Generator().manual_seed(0), device="cpu")
     for parameter in network.parameters():
+        block = drawn.to(parameter)
         flat = parameter.view(-1)
         for start in range(0, len(flat), len(block)):
             flat[start : start + len(block)] = block[: len(flat) - start]
@@ -68,8 +69,9 @@ def build(arm: str, args: argparse.Namespace, weights: torch.nn.Module | None = 
     """One arm's network; `weights` is LeRobot's, to copy from."""
     vlm, expert = ("gemma_2b", "gemma_300m") if args.full else ("small", "small")
     size, dtype = (224, torch.bfloat16) if args.full else (84, torch.float32)
+    device = getattr(args, "device", "cpu")  # where the weights are drawn: at the released size, a CPU takes minutes
     if arm == "lerobot":
-        with default_dtype(dtype), uninitialised():
+        with default_dtype(dtype), uninitialised(), torch.device(device):
             network = build_lerobot_pi05(
                 vlm, expert, image_size=size, chunk_size=args.chunk, max_action_dim=32,
                 dtype="bfloat16" if args.full else "float32",
@@ -82,7 +84,7 @@ def build(arm: str, args: argparse.Namespace, weights: torch.nn.Module | None = 
         PALIGEMMA_VARIANTS[vlm], EXPERT_VARIANTS[expert], size, args.chunk, 32, dtype=dtype, param_dtype=dtype,
         geometry=GeometrySegmentConfig(), rtc_training_max_delay=args.chunk - 1,
     )  # fmt: skip
-    with default_dtype(dtype), uninitialised():
+    with default_dtype(dtype), uninitialised(), torch.device(device):
         network = PI05Pytorch(config)
     for module in network.modules():  # what is stored in float32 was built in the default dtype
         if isinstance(module, Float32Module | torch.nn.LayerNorm):

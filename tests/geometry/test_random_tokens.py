@@ -23,6 +23,12 @@ def test_features_are_the_same_for_every_observation_and_every_run():
     assert first.valid.all()
 
 
+def test_features_are_the_same_where_modules_are_built_on_another_device():
+    with torch.device("meta"):
+        source = RandomSource(CAMERAS, 3)
+    assert torch.equal(source(observation(0)).features, RandomSource(CAMERAS, 3)(observation(0)).features)
+
+
 def test_features_are_standard_normal_and_differ_between_cells():
     features = RandomSource(CAMERAS, 8)(observation(0)).features[0].flatten(0, 1)
     assert features.mean().abs() < 0.05

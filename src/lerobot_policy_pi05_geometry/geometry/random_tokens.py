@@ -19,7 +19,9 @@ class RandomSource(GeometrySource):
         super().__init__()
         self.cameras, self.grid, self.feature_dim = cameras, grid, feature_dim
         generator = torch.Generator().manual_seed(_SEED)
-        self._features = torch.randn(1, len(cameras), grid**2, feature_dim, generator=generator)
+        shape = (1, len(cameras), grid**2, feature_dim)
+        # On the CPU also under `torch.device(...)`, as the generator is: every machine draws the same.
+        self._features = torch.randn(shape, generator=generator, device="cpu")
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
         return []
