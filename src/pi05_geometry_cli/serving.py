@@ -21,6 +21,9 @@ def serve(
         str | None, typer.Option(help="Sizes of batches, as 1,2,4: as many requests are computed together.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Of the noise, with the session and the request.")] = 0,
+    rig: Annotated[
+        int | None, typer.Option(help="Of a checkpoint trained on several rigs: the one whose robots are served.")
+    ] = None,
     lerobot: Annotated[
         bool, typer.Option("--lerobot", help="LeRobot's robot_client instead of openpi's clients (gRPC, loopback).")
     ] = False,
@@ -40,7 +43,7 @@ def serve(
         console.print(f"Loading {checkpoint} ...")
         serve_lerobot(
             checkpoint, device, host, 8080 if port is None else port, sizes, seed, 30.0 if fps is None else fps,
-            lambda at: console.print(f"Serving LeRobot's robot_client at {host}:{at}", soft_wrap=True),
+            lambda at: console.print(f"Serving LeRobot's robot_client at {host}:{at}", soft_wrap=True), rig,
         )  # fmt: skip
         return
     if fps is not None:
@@ -50,7 +53,7 @@ def serve(
     console.print(f"Loading {checkpoint} ...")
     serve_websocket(
         checkpoint, device, host, 8000 if port is None else port, key_file, sizes, seed,
-        lambda at: console.print(f"Serving at ws://{host}:{at}", soft_wrap=True),
+        lambda at: console.print(f"Serving at ws://{host}:{at}", soft_wrap=True), rig,
     )  # fmt: skip
 
 

@@ -5,12 +5,14 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from lerobot_policy_pi05_geometry.checkpoint.load import LoadedPolicy
+from lerobot_policy_pi05_geometry.geometry.calibration import Rig
 from lerobot_policy_pi05_geometry.serving.engine import Answer, Job
 from lerobot_policy_pi05_geometry.serving.inputs import Inputs
 from lerobot_policy_pi05_geometry.serving.limits import Limits
@@ -26,17 +28,28 @@ from tests.entry_points import (
     WRIST,
     WRIST_DEPTH,
     WRIST_POSE,
+    make_calibration,
     make_config,
     make_observation,
     make_policy,
     make_processors,
 )
 
+from .processes import POSE
+
 
 def load(seed: int = 0, **changes: Any) -> LoadedPolicy:
     """A tiny policy with its processors."""
     policy = make_policy(seed, **changes)
     return LoadedPolicy(policy, *make_processors(policy.config))
+
+
+def make_rigs(second_pose: list[list[float]] | None) -> dict[str, Rig]:
+    """Two robots whose cameras differ. second_pose: of the second one's wrist camera; None: it comes with every request."""
+    first, second = make_calibration(), make_calibration()
+    first["wrist"].extrinsics, second["wrist"].extrinsics = POSE, second_pose
+    second["front"] = replace(second["front"], intrinsics=[60.0, 20.0, 10.0, 20.0], extrinsics=POSE)
+    return {"2": Rig(first), "5": Rig(second)}
 
 
 def make_request(seed: int = 0, task: str = "push the button") -> dict[str, Any]:

@@ -24,19 +24,19 @@ from lerobot_policy_pi05_geometry.serving.service import make_service
 from tests.entry_points import ACTION_DIM, CHUNK, make_calibration, make_features, without
 
 from .processes import POSE, logged, run, server_process
-from .running import FakeEngine, fake_service, load, local_chunk
+from .running import FakeEngine, fake_service, load, local_chunk, make_rigs
 
 JOINTS = [f"joint_{i}.pos" for i in range(7)]
 CAMERAS = {"front": (30, 40, 3), "front_depth": (18, 24, 1), "wrist": (28, 28, 3), "wrist_depth": (12, 12, 1)}
 
 
-def load_posed():
+def load_posed(**changes):
     """A policy whose cameras' poses are all fixed."""
     inputs, outputs = make_features()
     calibration = make_calibration()
     calibration["wrist"].extrinsics = POSE
     features = without(inputs, "observation.calibration.wrist.extrinsics")
-    return load(calibration=calibration, input_features=features, output_features=outputs)
+    return load(**{"calibration": calibration, "input_features": features, "output_features": outputs, **changes})
 
 
 def instructions(**changes) -> RemotePolicyConfig:
@@ -117,10 +117,13 @@ class Sized:
         chunk_size = CHUNK
 
 
-def test_a_served_chunk_is_the_local_one(monkeypatch):
+@pytest.mark.parametrize("rig", [None, 5])
+def test_a_served_chunk_is_the_local_one(monkeypatch, rig):
+    """Also of a checkpoint that knows several rigs: robot_client cannot say which its robot is, so `serve --rig` does."""
     monkeypatch.setattr(secrets, "token_hex", lambda count: "robot")
-    loaded = load_posed()
-    with serving(make_service(loaded, (1,)), seed=5) as port:
+    rigs = {} if rig is None else {"calibration": {}, "rigs": make_rigs(POSE)}
+    loaded, served = load_posed(**rigs, rig=rig), load_posed(**rigs)
+    with serving(make_service(served, (1,), rig=rig), seed=5) as port:
         client = Client(port).begin()
         for number in range(2):
             observation = observe(number)
@@ -269,6 +272,12 @@ def test_others_cannot_reach_it(engine):
     for host in ("0.0.0.0", "::", "10.1.2.3"):
         with pytest.raises(ValueError, match="would serve everyone; listen on 127"):
             LeRobotServer(fake_posed(engine), host, 0, 0, 30.0)
+
+
+def test_a_rig_that_nobody_says_is_asked_for():
+    loaded = load_posed(calibration={}, rigs=make_rigs(POSE))
+    with pytest.raises(ValueError, match=r"rigs 2, 5, and robot_client cannot say .* --rig"):
+        LeRobotServer(make_service(loaded, (1,)), "127.0.0.1", 0, 0, 30.0)
 
 
 # --- the real robot_client ----------------------------------------------------------------------------------------

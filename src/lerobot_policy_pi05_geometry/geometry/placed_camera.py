@@ -8,7 +8,7 @@ from torch import Tensor
 from .calibration import Rig
 from .camera import CameraCalibration
 from .depth import LEROBOT_COUNT
-from .keys import RAW_STATE, RIG
+from .keys import RAW_STATE, RIG, batch_like
 from .kinematics import ForwardKinematics
 from .rigid import compose
 
@@ -50,7 +50,7 @@ class PlacedCamera:
         if len(self.ids) == 1:
             return None
         if self.only is not None:
-            return torch.tensor([self.ids.index(self.only)], device=next(iter(batch.values())).device)
+            return torch.tensor([self.ids.index(self.only)], device=batch_like(batch).device)
         if RIG not in batch:
             raise ValueError(
                 f"The policy was trained on data of several rigs ({', '.join(map(str, self.ids))}), and the "

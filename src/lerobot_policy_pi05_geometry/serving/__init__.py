@@ -3,6 +3,7 @@
 ```
    limits               what a request may cost, and the error that a client is told of
    wire                 openpi's msgpack frames, checked before anything is allocated
+   rigs                 which robot a request is of, where the checkpoint knows several
    inputs               a request in either spelling of keys -> a checked observation
    noise                the noise of a request, a function of session and request
    session              what the server keeps of one robot

@@ -11,7 +11,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from torch import Tensor
 
 from ..checkpoint.load import LoadedPolicy
-from ..geometry.keys import CALIBRATION_PREFIX, is_geometry_key
+from ..geometry.keys import CALIBRATION_PREFIX, RIG, is_geometry_key
 from .inputs import Guidance, Inputs, Request
 from .limits import RequestError
 from .noise import request_noise
@@ -73,7 +73,7 @@ def note_answer(session: Session, request: Request, answer: Answer) -> None:
     session.requests += 1
     session.begins = False
     session.seen.update(key for key in request.observation if is_geometry_key(key))
-    session.chunk = answer.chunk
+    session.chunk, session.rig = answer.chunk, request.rig
 
 
 class PolicyEngine:
@@ -117,7 +117,8 @@ class PolicyEngine:
         """Run every size of batch once with a short and a long instruction, so that kernels are loaded and graphs recorded."""
         for size in sizes:
             for words in (1, 6):
-                request = Request(_blank(inputs, self.config.depth_unit), "warm up " * words, None, None)
+                rig = next(iter(inputs.rigs.ids), None)
+                request = Request(_blank(inputs, self.config.depth_unit), "warm up " * words, None, None, rig)
                 self.run([Job(request, torch.zeros(self.noise_shape), begins=True)], size)
         self.policy.reset()
 
@@ -154,6 +155,8 @@ class PolicyEngine:
 def collate(requests: Sequence[Request]) -> dict[str, Any]:
     """A raw observation batch, converted as LeRobot's robots and environments do: images (B, 3, H, W) float32 in [0, 1]."""
     batch: dict[str, Any] = {"task": [request.task for request in requests]}
+    if requests[0].rig is not None:
+        batch[RIG] = torch.tensor([[request.rig] for request in requests])  # (B, 1), as in data of several rigs
     for key in requests[0].observation:
         arrays = torch.from_numpy(np.stack([request.observation[key] for request in requests]))
         if key.startswith(CALIBRATION_PREFIX) or arrays.ndim < 3:

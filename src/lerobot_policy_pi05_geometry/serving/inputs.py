@@ -6,6 +6,7 @@
    openpi, flat     observation/front
    state            observation.state          state                            observation/state
    instruction      task                       prompt
+   rig              observation.calibration.rig, or rig (rigs.py)
 ```
 
 dtype and shape are checked per key, before anything is converted. Arrays are of one observation, without a batch dimension.
@@ -20,8 +21,10 @@ from lerobot.configs import RTCAttentionSchedule
 from lerobot.utils.constants import OBS_STATE
 
 from ..configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
+from ..geometry.camera import CameraCalibration
 from ..geometry.keys import CALIBRATION_PREFIX, DEPTH_SUFFIX, IMAGE_PREFIX, depth_key, extrinsics_key, is_geometry_key
 from .limits import Limits, RequestError
+from .rigs import Rigs
 
 _FLOATS = ("<f4", "<f8")
 _IMAGE = (0, 0, 3)  # any height and width
@@ -62,19 +65,33 @@ class Guidance(NamedTuple):
 
 
 class Request(NamedTuple):
-    """A checked request. observation: by LeRobot's keys; images (H, W, 3), depth (H, W), poses (4, 4), state (D,)."""
+    """A checked request. observation: by LeRobot's keys; images (H, W, 3), depth (H, W), poses (4, 4), state (D,).
+
+    rig: number of the robot's rig; None for a checkpoint of one robot.
+    """
 
     observation: dict[str, np.ndarray]
     task: str
     guidance: Guidance | None
     noise: np.ndarray | None  # (S, max_action_dim) float32
+    rig: int | None = None
 
 
 class Inputs:
-    """What requests to a policy may hold. rename_map: names of the data -> names of the policy, as its preprocessor has it."""
+    """What requests to a policy may hold. rename_map: names of the data -> names of the policy, as its preprocessor has it.
 
-    def __init__(self, config: PI05GeometryConfig, limits: Limits, rename_map: Mapping[str, str] | None = None) -> None:
+    rig: the one that is served, of a checkpoint that has several.
+    """
+
+    def __init__(
+        self,
+        config: PI05GeometryConfig,
+        limits: Limits,
+        rename_map: Mapping[str, str] | None = None,
+        rig: int | None = None,
+    ) -> None:
         self._limits = limits
+        self.rigs = Rigs(config, rig)
         self._noise_shape = (config.chunk_size, config.max_action_dim)
         self._chunk_size = config.chunk_size
         self.expected = {entry.key: entry for entry in _expected(config)}
@@ -84,10 +101,10 @@ class Inputs:
             raw = [name for name, renamed in (rename_map or {}).items() if renamed == key]
             self._names.update(dict.fromkeys((*_spellings(key), *raw), key))
 
-    def read(self, message: Mapping[str, Any], seen: Iterable[str] = ()) -> Request:
+    def read(self, message: Mapping[str, Any], seen: Iterable[str] = (), rig: int | None = None) -> Request:
         """The request in a message. seen: keys that may be missing now, since the session has sent them before: a camera fails.
 
-        Raises RequestError with one sentence.
+        rig: of the session, if it has said so before. Raises RequestError with one sentence.
         """
         observation: dict[str, np.ndarray] = {}
         rest: dict[str, Any] = {}
@@ -99,6 +116,8 @@ class Inputs:
                 raise RequestError(f"The request has {key} twice, the second time as {name}.")
             else:
                 observation[key] = self._array(self.expected[key], name, value)
+        rig = self.rigs.take(rest, rig)
+        self.rigs.require(rig)
         missing = [k for k, e in self.expected.items() if e.required and k not in observation]
         for key in missing:
             if not (is_geometry_key(key) and key in seen):
@@ -111,7 +130,7 @@ class Inputs:
                 f"The request has {_short(next(iter(rest)))}, which this policy does not know; it takes "
                 f"{', '.join(self.expected)} and prompt."
             )
-        return Request(observation, task, guidance, noise)
+        return Request(observation, task, guidance, noise, rig)
 
     def key_of(self, name: str) -> str | None:
         """The key that a name in a request stands for; None for one that is not expected."""
@@ -183,13 +202,17 @@ def _expected(config: PI05GeometryConfig) -> Iterable[Input]:
     if config.geometry_source == "rgbd":
         for camera, size in config.depth_cameras().items():
             yield Input(depth_key(camera), size, ("<u2", "<f4"), config.depth_unit, True)
-            known = config.calibration.get(camera)  # data of several rigs has its calibration in config.rigs
-            placed = known is None or known.extrinsics is not None or known.mount is not None
+            rigs = [rig.cameras for rig in config.rigs.values()] or [config.calibration]
+            placed = all(_is_placed(cameras.get(camera)) for cameras in rigs)
             posed = config.geometry_frame == "camera" or placed
             yield Input(extrinsics_key(camera), (4, 4), _FLOATS, "base_T_camera in metres, OpenCV axes", not posed)
     state = config.robot_state_feature
     assert state is not None  # validate_features adds it
     yield Input(OBS_STATE, tuple(state.shape), _FLOATS, "as recorded, not normalised", True)
+
+
+def _is_placed(camera: CameraCalibration | None) -> bool:
+    return camera is None or camera.extrinsics is not None or camera.mount is not None
 
 
 def _spellings(key: str) -> Iterable[str]:

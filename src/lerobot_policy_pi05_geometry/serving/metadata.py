@@ -35,6 +35,9 @@ def describe(engine: PolicyEngine, inputs: Inputs, seed: int, version: str) -> d
         },
         "prompt": "one text, as prompt or task",
         "depth_unit": config.depth_unit,
+        # A request names one of these as `rig`; it need not if there is a default, or if its session has done so before.
+        "rigs": inputs.rigs.ids,
+        "default_rig": inputs.rigs.default,
         "real_time_chunking": {
             "inference_delay": "actions executed before the new chunk arrives",
             "executed_steps": "actions of the last chunk executed when the observation was made",

@@ -30,13 +30,18 @@ class Service(NamedTuple):
     limits: Limits
 
 
-def make_service(loaded: LoadedPolicy, sizes: Sequence[int] | None = None, limits: Limits | None = None) -> Service:
-    """sizes: of batches, ascending; None: up to 4, in steps for which a GPU's graphs are recorded."""
+def make_service(
+    loaded: LoadedPolicy, sizes: Sequence[int] | None = None, limits: Limits | None = None, rig: int | None = None
+) -> Service:
+    """sizes: of batches, ascending; None: up to 4, in steps for which a GPU's graphs are recorded. rig: the only one served.
+
+    Raises ValueError for a rig that the checkpoint does not have.
+    """
     limits = limits or Limits()
     engine = PolicyEngine(loaded)
     steps = getattr(loaded.preprocess, "steps", ())
     rename = next((s.rename_map for s in steps if isinstance(s, RenameObservationsProcessorStep)), None)
-    inputs = Inputs(engine.config, limits, rename)
+    inputs = Inputs(engine.config, limits, rename, rig)
     if sizes is None:
         # Two lengths of prompt and three sizes are six graphs; eight stay recorded (inference/cuda_graphs.py).
         sizes = (1, 2, 4) if str(engine.config.device).startswith("cuda") else (1, 2, 3, 4)
@@ -60,11 +65,12 @@ def serve_websocket(
     sizes: Sequence[int] | None,
     seed: int,
     listening: Callable[[int], None],
+    rig: int | None = None,
 ) -> None:
     """Serve a checkpoint until SIGTERM or SIGINT. Raises ValueError for a host that others reach without a key."""
     key = read_key(key_file)
     require_safe(host, key)
-    server = make_websocket_server(make_service(load_policy(checkpoint, device), sizes), seed, key)
+    server = make_websocket_server(make_service(load_policy(checkpoint, device), sizes, rig=rig), seed, key)
 
     async def run() -> None:
         stop = asyncio.Event()

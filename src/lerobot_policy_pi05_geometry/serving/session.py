@@ -21,6 +21,7 @@ class Session:
     begins: bool = True  # whether the next request is the first of an episode
     seen: set[str] = field(default_factory=set)  # keys of geometry that it has sent
     chunk: Tensor | None = None  # the last, normalised: (S, A) on the CPU
+    rig: int | None = None  # which one the robot is, of a policy that knows several
 
     def reset(self) -> None:
         """A new episode: the next chunk continues none."""

@@ -148,6 +148,7 @@ class WebsocketServer:
             message = decode(frame, self._limits)
             endpoint = message.pop("endpoint", "infer")
             if endpoint == "reset":
+                session.rig = self._inputs.rigs.take(message, session.rig)
                 session.reset()
                 return {"status": "reset", "session": session.name, "episode": session.episode}
             if endpoint != "infer":
@@ -164,7 +165,7 @@ class WebsocketServer:
             return f"The server failed on this request; its log says why under error {number}."
 
     async def _infer(self, connection: ServerConnection, session: Session, message: dict[str, Any]) -> dict[str, Any]:
-        request = self._inputs.read(message, session.seen)
+        request = self._inputs.read(message, session.seen, session.rig)
         waiting = self._worker.submit(make_job(session, request, self._seed, self._noise_shape))
         future = asyncio.ensure_future(asyncio.wrap_future(waiting))
         gone = asyncio.ensure_future(connection.wait_closed())

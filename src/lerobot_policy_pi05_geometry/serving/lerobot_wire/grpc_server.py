@@ -176,8 +176,14 @@ class LeRobotServer:
     """The servicer on a port. The service's worker runs from `start` to `stop`."""
 
     def __init__(self, service: Service, host: str, port: int, seed: int, fps: float) -> None:
-        """Raises ValueError for a host that others reach, RuntimeError if the port is taken."""
+        """Raises ValueError for a host that others reach or a rig that is not said, RuntimeError if the port is taken."""
         require_loopback(host)
+        rigs = service.inputs.rigs
+        if rigs.ids and rigs.default is None:
+            raise ValueError(
+                f"The checkpoint was trained on the rigs {', '.join(map(str, rigs.ids))}, and robot_client cannot say which one "
+                "its robot is; say it with --rig."
+            )
         self._worker = service.worker
         self._server = grpc.server(
             ThreadPoolExecutor(2 * _CLIENTS + 2, thread_name_prefix="grpc"),
@@ -207,6 +213,7 @@ def serve_lerobot(
     seed: int,
     fps: float,
     listening: Callable[[int], None],
+    rig: int | None = None,
 ) -> None:
     """Serve a checkpoint to robot_clients until SIGTERM or SIGINT."""
     if not fps > 0:
@@ -215,7 +222,7 @@ def serve_lerobot(
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    server = LeRobotServer(make_service(load_policy(checkpoint, device), sizes), host, port, seed, fps)
+    server = LeRobotServer(make_service(load_policy(checkpoint, device), sizes, rig=rig), host, port, seed, fps)
     server.start()
     listening(server.port)
     stop.wait()

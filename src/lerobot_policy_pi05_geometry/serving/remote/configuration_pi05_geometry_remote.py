@@ -24,6 +24,7 @@ class PI05GeometryRemoteConfig(PreTrainedConfig):
     n_action_steps: int | None = None  # actions executed of a chunk; None: as the checkpoint says
     # server: keyed by session and request. client: drawn here from torch's generator, as a local policy draws it.
     noise: str = "server"
+    rig: int | None = None  # which rig this robot is, if the server's policy knows several
     rename_map: dict[str, str] = field(default_factory=dict)  # the robot's keys -> the checkpoint's
     rtc_config: RTCConfig | None = None
 

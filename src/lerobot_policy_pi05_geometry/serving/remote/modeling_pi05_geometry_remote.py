@@ -17,7 +17,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from ...geometry.keys import is_geometry_key
+from ...geometry.keys import RIG, is_geometry_key
 from ..extras import require_extra
 
 require_extra("serve", "websockets", "msgpack")
@@ -76,6 +76,10 @@ class PI05GeometryRemotePolicy(PreTrainedPolicy):
             raise ValueError(
                 f"n_action_steps ({self._action_steps}) must not exceed the server's chunk_size ({config.chunk_size})."
             )
+        self._rigs = told.get("rigs") or []
+        if config.rig is not None and config.rig not in self._rigs:
+            have = f"the rigs {', '.join(map(str, self._rigs))}" if self._rigs else "no rigs"
+            raise ValueError(f"The server's policy has {have}, but --policy.rig is {config.rig}.")
         config.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, (told["action_dim"],))}
         # As a local policy does, geometry stays out of the features that LeRobot compares with the robot's cameras.
         config.input_features = {
@@ -122,6 +126,7 @@ class PI05GeometryRemotePolicy(PreTrainedPolicy):
             if noise is not None:
                 request["noise"] = noise[row].float().cpu().numpy()
             request.update(self._guidance(session, row, **kwargs))
+            request.update(self._rig(batch, row))
             session.begin(request)
         chunks: list[Tensor] = []
         refused: RefusedError | None = None
@@ -133,6 +138,12 @@ class PI05GeometryRemotePolicy(PreTrainedPolicy):
         if refused is not None:
             raise refused
         return torch.stack(chunks).to(self.config.device)
+
+    def _rig(self, batch: dict[str, Any], row: int) -> dict[str, int]:
+        """Which rig a row's robot is, as the configuration or else the batch says; nothing if the server need not know."""
+        if not self._rigs or (self.config.rig is None and RIG not in batch):
+            return {}
+        return {"rig": int(batch[RIG].flatten()[row]) if self.config.rig is None else self.config.rig}
 
     def _guidance(
         self,
