@@ -1,8 +1,5 @@
 """A study on a user's own dataset: what is held out, what is compared, and what comes out."""
 
-import os
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,6 +19,7 @@ from lerobot_policy_pi05_geometry.study.held_out import (
     hide_depth,
     view_conditions,
 )
+from tests import commands
 
 pytestmark = pytest.mark.sim
 FRONT_DEPTH, WRIST_DEPTH = "observation.images.front_depth", "observation.images.wrist_depth"
@@ -95,10 +93,7 @@ def test_a_study_of_a_dataset_end_to_end(root, tmp_path):
         "--policy.action_expert_variant=tiny", "--policy.image_resolution=[28, 28]", "--policy.chunk_size=4",
         "--policy.n_action_steps=4", "--batch_size=4",
     ]  # fmt: skip
-    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
-    command = [sys.executable, "-m", "pi05_geometry_cli", *arguments]
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500)
-    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-2000:]
+    commands.run("pi05_geometry_cli.__main__", *arguments)
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img ") == 2
     assert "open-loop error, not success" in page

@@ -17,6 +17,7 @@ from lerobot_policy_pi05_geometry.study.plan import runs_of
 from lerobot_policy_pi05_geometry.study.simulated import SimulatedRun
 from lerobot_policy_pi05_geometry.study.spec import read_spec
 from lerobot_policy_pi05_geometry.study.training_log import read_curve, read_log_line
+from tests import commands
 
 pytestmark = [pytest.mark.train, pytest.mark.sim]
 CLI = [sys.executable, "-m", "pi05_geometry_cli"]
@@ -25,9 +26,7 @@ ENVIRONMENT = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "COLU
 
 def command(*arguments: str, code: int = 0, timeout: float = 500) -> str:
     """Run `pi05-geometry` without a hub; returns what it printed."""
-    result = subprocess.run([*CLI, *arguments], env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout)
-    assert result.returncode == code, result.stdout[-2000:] + result.stderr[-3000:]
-    return result.stdout
+    return commands.run("pi05_geometry_cli.__main__", *arguments, code=code, timeout=timeout)
 
 
 SHORT = """

@@ -1,10 +1,7 @@
 """LeRobot's own commands on a recorded dataset: train, stop, resume, evaluate. Each is a process of its own."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +11,7 @@ from safetensors.torch import load_file
 from lerobot_policy_pi05_geometry.checkpoint.conversion import convert
 from lerobot_policy_pi05_geometry.geometry.da3.weights import backbone_hash
 from lerobot_policy_pi05_geometry.sim.record import record
+from tests import commands
 from tests.geometry.da3.tiny import write_tiny
 
 from ..checkpoint.conversion.sources import write_lerobot
@@ -25,15 +23,7 @@ SIZE = 28
 
 def lerobot(command: str, *arguments: str) -> str:
     """Run `lerobot-train` or `lerobot-eval` without a hub; returns what it logged."""
-    result = subprocess.run(
-        [sys.executable, "-m", f"lerobot.scripts.lerobot_{command}", *arguments],
-        env=os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "MUJOCO_GL": "egl"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert result.returncode == 0, result.stderr[-3000:]
-    return result.stderr + result.stdout
+    return commands.run(f"lerobot.scripts.lerobot_{command}", *arguments)
 
 
 @pytest.fixture(scope="module")

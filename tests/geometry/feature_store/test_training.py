@@ -1,10 +1,7 @@
 """The commands: precompute by two ranks, lerobot-train from the store, stopped and resumed. Each is a process of its own."""
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,6 +9,7 @@ import torch
 from safetensors.torch import load_file
 
 from lerobot_policy_pi05_geometry.geometry.da3.weights import backbone_hash
+from tests import commands
 from tests.datasets import REPO_ID, write_dataset
 from tests.geometry.da3.tiny import write_tiny
 from tests.geometry.feature_store.test_shards import files
@@ -21,22 +19,8 @@ pytestmark = pytest.mark.train
 SIZE = 28
 
 
-def command(*arguments: str, fails: bool = False, **environment: str) -> str:
-    """Run a command of Python modules without a hub; returns what it wrote."""
-    settings = {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
-    result = subprocess.run(
-        [sys.executable, "-m", *arguments],
-        env=os.environ | settings | environment,
-        capture_output=True,
-        text=True,
-        timeout=500,
-    )
-    assert (result.returncode != 0) == fails, result.stdout[-2000:] + result.stderr[-3000:]
-    return result.stdout + result.stderr
-
-
-def ours(*arguments: str, fails: bool = False, **environment: str) -> str:
-    return command("pi05_geometry_cli", *arguments, fails=fails, **environment)
+def ours(*arguments: str, code: int = 0, **environment: str) -> str:
+    return commands.run("pi05_geometry_cli.__main__", *arguments, code=code, **environment)
 
 
 def training(root: Path, output: Path) -> list[str]:
@@ -79,7 +63,7 @@ def test_computed_by_two_ranks_then_trained_and_resumed_bit_for_bit(tmp_path):
     assert files(shared) == files(alone)
 
     output = tmp_path / "run"
-    log = command("lerobot.scripts.lerobot_train", *training(root, output))
+    log = commands.run("lerobot.scripts.lerobot_train", *training(root, output))
     assert "eval_loss" in log
     checkpoints = output / "checkpoints"
     config = json.loads((checkpoints / "last" / "pretrained_model" / "config.json").read_text())
@@ -89,7 +73,7 @@ def test_computed_by_two_ranks_then_trained_and_resumed_bit_for_bit(tmp_path):
     shutil.move(checkpoints / "000002", tmp_path / "uninterrupted")
     (checkpoints / "last").unlink()
     resumed = checkpoints / "000001" / "pretrained_model" / "train_config.json"
-    command("lerobot.scripts.lerobot_train", f"--config_path={resumed}", "--resume=true")
+    commands.run("lerobot.scripts.lerobot_train", f"--config_path={resumed}", "--resume=true")
     expected = load_file(tmp_path / "uninterrupted" / "pretrained_model" / "model.safetensors")
     found = load_file(checkpoints / "000002" / "pretrained_model" / "model.safetensors")
     assert found.keys() == expected.keys()
@@ -97,4 +81,4 @@ def test_computed_by_two_ranks_then_trained_and_resumed_bit_for_bit(tmp_path):
         assert torch.equal(found[name], tensor), name
 
     augmented = [*training(root, tmp_path / "augmented"), "--dataset.image_transforms.enable=true"]
-    assert "cannot be augmented" in ours("train", *augmented, fails=True)
+    assert "cannot be augmented" in ours("train", *augmented, code=1)
