@@ -6,7 +6,7 @@ This is a package of its own because importing `lerobot_policy_pi05_geometry` im
    app           the application, and options shared by several commands
    studies       demo, study                 simulation   record, train, evaluate
    checkpoints   inspect, bench, convert, export, merge
-   datasets      quantiles, store-calibration, precompute       planning     plan
+   datasets      quantiles, store-calibration, merge-rigs, precompute   planning   plan
    serving       serve                       libero       libero-replay, libero-floors, libero-report
    calibration   calibrate (board, camera, arm, hand-eye), scene
 ```

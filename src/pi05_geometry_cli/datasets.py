@@ -1,4 +1,4 @@
-"""The commands on a dataset: quantiles, store-calibration, precompute."""
+"""The commands on a dataset: quantiles, store-calibration, merge-rigs, precompute."""
 
 from pathlib import Path
 from typing import Annotated
@@ -49,6 +49,20 @@ def store_calibration(
     console.print(
         f"Stored the calibration of {', '.join(found.cameras) or 'several rigs'} in {dataset_root / 'meta' / 'info.json'}."
     )
+
+
+@app.command()
+def merge_rigs(
+    datasets: Annotated[list[Path], typer.Argument(help="Folders of LeRobotDatasets, each with its calibration.")],
+    output: Annotated[Path, typer.Option(help="Folder of the merged dataset.")],
+    repo_id: Annotated[str, typer.Option(help="Its id.")] = "local/merged",
+) -> None:
+    """Merge datasets of several robots with LeRobot's tool, so that every frame keeps its own robot's calibration."""
+    from lerobot_policy_pi05_geometry.robot.merge_rigs import merge_rigs as merge
+
+    for root, number in merge(datasets, output, repo_id).items():
+        console.print(f"{root}: rig {number}")
+    console.print(f"Wrote [bold]{output}[/bold]; act on one of these robots with --policy.rig=NUMBER.")
 
 
 @app.command()
