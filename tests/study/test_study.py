@@ -160,6 +160,7 @@ def test_a_checkpoint_is_evaluated_and_inspected(study, tmp_path):
     assert "there is no frame 99999" in command("inspect", str(run.checkpoint), dataset, "--frame", "99999", code=1)
 
 
+@pytest.mark.long
 def test_two_ranks_of_torchrun_share_the_runs(short, short_table, tmp_path):
     """Each rank its half, no run twice; the same table as from one process."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "-m"]
