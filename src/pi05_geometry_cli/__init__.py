@@ -8,7 +8,7 @@ This is a package of its own because importing `lerobot_policy_pi05_geometry` im
    checkpoints   inspect, bench, convert, export, merge
    datasets      quantiles, store-calibration, merge-rigs, precompute   planning   plan
    serving       serve                       libero       libero-replay, libero-floors, libero-report
-   calibration   calibrate (board, camera, arm, hand-eye), scene
+   calibration   calibrate (board, camera, arm, hand-eye, depth), scene
 ```
 """
 

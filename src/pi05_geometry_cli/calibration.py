@@ -1,4 +1,4 @@
-"""The commands that make a calibration file: calibrate board, camera, arm, hand-eye; and scene, which shows what it says."""
+"""The commands that make and check a calibration file: calibrate board, camera, arm, hand-eye, depth; scene shows it."""
 
 from pathlib import Path
 from typing import Annotated
@@ -161,6 +161,27 @@ def hand_eye(
         f"No recording can tell the offset of {found.fixed_joints[0]} from a turn of the base, nor that of "
         f"{found.fixed_joints[1]} from a "
         f"turn of what the hand carries: both stay as they were. Wrote [bold]{file}[/bold]; look at [bold]{picture}[/bold]."
+    )
+
+
+@calibrate.command()
+def depth(
+    camera: Annotated[str, typer.Option(help="The camera to check.")],
+    model: Annotated[Path, typer.Option(help="URDF or MJCF file of the arm, with its meshes.")],
+    dataset_root: Root,
+    dataset_repo_id: RepoId = "local/dataset",
+    arm: Annotated[str, typer.Option(help="The arm's name in the calibration.")] = "arm",
+    file: File = Path("calibration.json"),
+) -> None:
+    """Check a camera's depth against the arm in its view: more than 10 % off is an error."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_policy_pi05_geometry.robot.link_depth import check_link_depth
+
+    found = check_link_depth(LeRobotDataset(dataset_repo_id, root=dataset_root), _read(file), camera, arm, model)
+    console.print(
+        f"{camera}: measured depth of the arm is {found.ratio:.3f} times what its links say (median of {found.pixels} pixels in "
+        f"{found.frames} frames)."
     )
 
 

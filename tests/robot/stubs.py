@@ -13,7 +13,11 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
+import torch
 
+from lerobot_policy_pi05_geometry.geometry.calibration import Calibration
+from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, Mount
+from lerobot_policy_pi05_geometry.geometry.kinematics import ForwardKinematics
 from lerobot_policy_pi05_geometry.sim.headless import mujoco
 from tests.geometry.arms import JOINTS, mjcf_of, so101_like
 
@@ -114,6 +118,26 @@ class World:
 
     def renderer(self) -> mujoco.Renderer:
         return mujoco.Renderer(self.model, HEIGHT, WIDTH)
+
+
+def true_calibration(world: World) -> Calibration:
+    """What a perfect `pi05-geometry calibrate` would write."""
+    arm = so101_like()
+    for joint in arm.joints:
+        joint.offset = np.radians(OFFSETS[joint.joint])
+    motors = dict.fromkeys(JOINTS, 0.0)
+    state = torch.zeros(1, 6, dtype=torch.float64)
+    link = ForwardKinematics(arm, ["gripper"])(state)[0, 0].numpy()
+    link_T_camera = np.linalg.inv(link) @ world.camera_pose("wrist", motors)
+    cameras = {
+        "front": CameraCalibration(intrinsics(), [WIDTH, HEIGHT], world.camera_pose("front", motors).tolist()),
+        "wrist": CameraCalibration(
+            intrinsics(), [WIDTH, HEIGHT], mount=Mount("arm", "gripper", link_T_camera.tolist())
+        ),
+    }
+    for name, camera in cameras.items():
+        camera.depth_scale = DEPTH_SCALE[name]
+    return Calibration(cameras, {"arm": arm})
 
 
 class MotorBus:

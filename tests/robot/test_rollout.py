@@ -14,14 +14,22 @@ from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_featu
 
 pytest.importorskip("mujoco")
 
-from lerobot_policy_pi05_geometry.geometry.calibration import Calibration, read_calibration_file, write_calibration_file
-from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, Mount
+from lerobot_policy_pi05_geometry.geometry.calibration import read_calibration_file, write_calibration_file
 from lerobot_policy_pi05_geometry.geometry.dataset_calibration import write_dataset_calibration
 from lerobot_policy_pi05_geometry.geometry.keys import RAW_STATE, depth_key
-from lerobot_policy_pi05_geometry.geometry.kinematics import ForwardKinematics
 from lerobot_policy_pi05_geometry.geometry.rgbd import RgbdSource
-from tests.geometry.arms import JOINTS, so101_like
-from tests.robot.stubs import DEPTH_SCALE, HEIGHT, OFFSETS, WIDTH, MotorBus, World, intrinsics, make_pyrealsense2
+from tests.geometry.arms import JOINTS
+from tests.robot.stubs import (
+    DEPTH_SCALE,
+    HEIGHT,
+    OFFSETS,
+    WIDTH,
+    MotorBus,
+    World,
+    intrinsics,
+    make_pyrealsense2,
+    true_calibration,
+)
 
 pytestmark = [pytest.mark.sim, pytest.mark.train]
 
@@ -56,26 +64,6 @@ def cameras_option() -> str:
         f"{{front: {{type: intelrealsense, serial_number_or_name: '111', {settings}}}, "
         f"wrist: {{type: intelrealsense, serial_number_or_name: '222', {settings}}}}}"
     )
-
-
-def true_calibration(world: World) -> Calibration:
-    """What a perfect `pi05-geometry calibrate` would write."""
-    arm = so101_like()
-    for joint in arm.joints:
-        joint.offset = np.radians(OFFSETS[joint.joint])
-    motors = dict.fromkeys(JOINTS, 0.0)
-    state = torch.zeros(1, 6, dtype=torch.float64)
-    link = ForwardKinematics(arm, ["gripper"])(state)[0, 0].numpy()
-    link_T_camera = np.linalg.inv(link) @ world.camera_pose("wrist", motors)
-    cameras = {
-        "front": CameraCalibration(intrinsics(), [WIDTH, HEIGHT], world.camera_pose("front", motors).tolist()),
-        "wrist": CameraCalibration(
-            intrinsics(), [WIDTH, HEIGHT], mount=Mount("arm", "gripper", link_T_camera.tolist())
-        ),
-    }
-    for name, camera in cameras.items():
-        camera.depth_scale = DEPTH_SCALE[name]
-    return Calibration(cameras, {"arm": arm})
 
 
 @pytest.fixture(scope="module")

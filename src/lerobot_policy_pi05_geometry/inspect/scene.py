@@ -93,7 +93,8 @@ def log_to_rerun(scene: Scene, path: str) -> None:
         import rerun as rr
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            "Writing a rerun file needs rerun; install it with `pip install 'lerobot[viz]'`, or leave --rerun out."
+            "Writing a rerun file needs rerun; install it with `pip install 'lerobot_policy_pi05_geometry[robot]'`, or leave "
+            "--rerun out."
         ) from error
     recording = rr.RecordingStream("pi05_geometry_scene")
     recording.save(path)

@@ -97,7 +97,7 @@ def _read_mjcf(path: Path) -> list[Link]:
         from ..sim.headless import mujoco
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            "Reading an MJCF file needs MuJoCo; install it with `pip install 'lerobot_policy_pi05_geometry[sim]'`, or "
+            "Reading an MJCF file needs MuJoCo; install it with `pip install 'lerobot_policy_pi05_geometry[robot]'`, or "
             "give a URDF."
         ) from error
     try:
