@@ -1,7 +1,12 @@
 """Checkpoints on disk, and servers and LeRobot's programs as processes of their own."""
 
+import contextlib
+import io
 import json
+import logging
 import os
+import runpy
+import signal
 import subprocess
 import sys
 import time
@@ -9,6 +14,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from tests.entry_points import make_calibration, make_features, make_policy, make_processors, without
 
@@ -85,6 +92,31 @@ def run(module: str, *options: str, folder: Path, timeout: float = 120, **env: s
     )  # fmt: skip
     assert result.returncode in (0, 1, -2, 130), result.stdout[-3000:] + result.stderr[-6000:]
     return result.stdout + result.stderr
+
+
+def run_here(module: str, *options: str, folder: Path, timeout: float = 120) -> str:
+    """As `run`, within this process, which has imported what takes a new one ten seconds. In the main thread only."""
+    root, output = logging.getLogger(), io.StringIO()
+    handlers, level = root.handlers[:], root.level
+    handled = {
+        number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for path in plugin_path(folder / "plugins"):
+            patch.syspath_prepend(path)
+        patch.chdir(folder)  # they write logs there
+        patch.setattr(sys, "argv", [module, *options, f"--robot.calibration_dir={folder}"])
+        try:
+            with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+                runpy.run_module(module, run_name="__main__", alter_sys=True)
+        except KeyboardInterrupt:  # how the simulated robot ends a program
+            pass
+        finally:
+            root.handlers[:] = handlers
+            root.setLevel(level)
+            for number, handler in handled.items():
+                signal.signal(number, handler)
+    return output.getvalue()
 
 
 def logged(path: Path) -> list[dict[str, float]]:

@@ -147,6 +147,7 @@ class Running:
     def join(self) -> None:
         self._thread.join(60)
         assert not self._thread.is_alive()
+        assert not asyncio.all_tasks(self._loop)  # nothing of it is left behind
 
     @property
     def url(self) -> str:

@@ -33,10 +33,9 @@ def python(tmp_path_factory) -> Path:
         return Path(kept)
     folder = tmp_path_factory.mktemp("openpi") / "venv"
     found = folder / "bin" / "python"
-    for command in (
-        [sys.executable, "-m", "venv", str(folder)],
-        [str(found), "-m", "pip", "install", "--quiet", *PACKAGES],
-    ):
+    # This environment's pip fills it: a new one would have to be installed first, and compiled, as everything.
+    pip = [sys.executable, "-m", "pip", f"--python={found}", "install", "--quiet", "--no-compile", *PACKAGES]
+    for command in ([sys.executable, "-m", "venv", "--without-pip", str(folder)], pip):
         result = subprocess.run(command, capture_output=True, text=True, timeout=300)
         assert result.returncode == 0, result.stderr[-2000:]
     return found

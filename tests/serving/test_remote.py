@@ -3,6 +3,7 @@
 import copy
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from tests.entry_points import (
     without,
 )
 
-from .processes import logged, run, server_process
+from .processes import logged, run, run_here, server_process
 from .running import FakeEngine, fake_server, load, real_server, serving
 
 
@@ -240,7 +241,7 @@ def test_its_configuration_is_saved_without_the_key(tmp_path, monkeypatch):
 # --- in LeRobot's own programs ------------------------------------------------------------------------------------
 
 
-def rollout(port: int, engine: str, folder: Path, actions: int) -> None:
+def rollout(run: Callable[..., str], port: int, engine: str, folder: Path, actions: int) -> None:
     printed = run(
         "lerobot.scripts.lerobot_rollout",
         "--robot.type=simulated", "--robot.id=test", f"--robot.log={folder / 'actions.jsonl'}", f"--robot.actions={actions}",
@@ -261,11 +262,11 @@ def rollout(port: int, engine: str, folder: Path, actions: int) -> None:
 def test_lerobot_rollout(checkpoint, tmp_path):
     """LeRobot's unmodified program, with real-time chunking."""
     with serving(real_server(load_policy(checkpoint))) as running:
-        rollout(running.port, "rtc", tmp_path, 60)
+        rollout(run_here, running.port, "rtc", tmp_path, 60)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("engine", ["sync", "rtc"])
 def test_lerobot_rollout_and_a_server_process(checkpoint, tmp_path, engine):
     with server_process(checkpoint, log=tmp_path / "server.log") as (port, _):
-        rollout(port, engine, tmp_path, 200)
+        rollout(run, port, engine, tmp_path, 200)

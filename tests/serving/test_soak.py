@@ -6,13 +6,13 @@ from .soak import FAULTS, soak
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [10, pytest.param(1800, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seconds", [7, pytest.param(1800, marks=pytest.mark.long)])
 def test_no_chunk_is_lost_or_foreign_whatever_goes_wrong(seconds):
     short = seconds < 60
     seen = soak(
         seconds,
         robots=4 if short else 8,
-        fault=1.5 if short else 30,
+        fault=1 if short else 30,
         rate=20 if short else 3,
         side=40 if short else 640,
     )

@@ -356,6 +356,18 @@ def test_health_follows_warming_up_and_draining(engine):
             client.infer(mine(4))
 
 
+def test_a_server_that_is_stopped_while_it_warms_up_ends(engine):
+    server, warm = fake_server(engine), threading.Event()
+    server._worker._warm_up = lambda: warm.wait(5)
+    with serving(server) as running:
+        running.terminate()
+        while not server._draining:
+            time.sleep(0.01)
+        warm.set()
+        running.join()
+        assert running.error is None
+
+
 def test_a_server_that_cannot_warm_up_ends_with_its_error(engine):
     server = fake_server(engine)
 

@@ -86,6 +86,7 @@ class WebsocketServer:
                     await stopped
                 finally:
                     stopped.cancel()
+                    warm.cancel()  # it is still waited for if the signal came first
                 await self._drain(drain_seconds)
         finally:
             await asyncio.to_thread(self._worker.close)
