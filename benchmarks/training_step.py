@@ -3,6 +3,7 @@
     python -m benchmarks.training_step                     small size, float32
     python -m benchmarks.training_step --size mid          six times wider layers, still for a CPU
     python -m benchmarks.training_step --size full --device cuda    released size, bf16 compute over float32 weights
+    python -m benchmarks.training_step --size full --device cuda --arms geometry "geometry, compiled" lerobot "lerobot, compiled"
     python -m benchmarks.training_step --flow-samples 20   loss after 20 s of training at K = 1, 2, 4, 8
 
 The step against LeRobot's is forward and backward, without an optimiser. All arms run the same weights and batch in one
@@ -10,10 +11,15 @@ process, in turn, round by round; a ratio is the median over rounds of ours / Le
 others use too, `--cpu-time` with one thread (OMP_NUM_THREADS=1) counts what this process has used. Memory is the peak of live
 tensors in one step, weights and gradients included. Ours pads prompts to what the batch needs (`--prompt`), LeRobot's always to
 200: `--prompt 200` takes that apart.
+
+The compiled arms are compile_model=true: ours by layers (model/layer_calls.py), LeRobot's the forward pass as a whole, in its
+mode max-autotune or the one given. The first step, which compiles, is reported apart. `--arms` chooses what is run, without
+micro-batches.
 """
 
 import argparse
 import json
+import os
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -37,7 +43,9 @@ from lerobot_policy_pi05_geometry.model.variants import (
 )
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 
-ARMS = ("geometry", "no geometry", "lerobot")
+ARMS = ("geometry", "no geometry", "lerobot")  # run unless --arms says otherwise
+COMPILED = ", compiled"
+ALL_ARMS = (*ARMS, *(arm + COMPILED for arm in ARMS))
 CHUNK, ACTION_DIM, GRID = 50, 32, 8
 IMAGE_SIZE = {"small": 84, "mid": 112, "full": 224}
 VARIANTS = {"small": ("small", "small"), "mid": ("mid", "mid"), "full": ("gemma_2b", "gemma_300m")}
@@ -88,44 +96,64 @@ def network_steps(args: argparse.Namespace, networks: dict[str, nn.Module]) -> d
     present = [torch.ones(B, dtype=torch.bool, device=args.device)] * args.cameras
     short = (text[:, : args.prompt], mask[:, : args.prompt])
 
+    # As LeRobot does on compile_model, but kept apart from the network that runs without.
+    lerobot_compiled = torch.compile(networks["lerobot"].forward, mode=args.lerobot_compile_mode)
+
     def step(arm: str) -> None:
-        network = networks["lerobot" if arm == "lerobot" else "ours"]
+        kind, compiled = arm.removesuffix(COMPILED), arm.endswith(COMPILED)
+        network = network_of(arm, networks)
         network.zero_grad()
-        prompt = (text, mask) if arm == "lerobot" else short
-        geometry = (tokens,) if arm == "geometry" else ()
+        prompt = (text, mask) if kind == "lerobot" else short
+        geometry = (tokens,) if kind == "geometry" else ()
+        networks["ours"].paligemma_with_expert.compiled = compiled
+        call = lerobot_compiled if arm == "lerobot" + COMPILED else network
         # bf16 compute of LeRobot's is what accelerate gives it; ours switches autocast on by itself.
         with torch.autocast(args.device, torch.bfloat16, enabled=args.size == "full"):
-            loss = network(images, present, *prompt, actions, noise, flow_time, *geometry).mean()
+            loss = call(images, present, *prompt, actions, noise, flow_time, *geometry).mean()
         loss.backward()
         if args.device == "cuda":
             torch.cuda.synchronize()
 
-    return {arm: lambda arm=arm: step(arm) for arm in ARMS}
+    return {arm: lambda arm=arm: step(arm) for arm in args.arms or ARMS}
+
+
+def network_of(arm: str, networks: dict[str, nn.Module]) -> nn.Module:
+    return networks["lerobot" if arm.startswith("lerobot") else "ours"]
+
+
+def used_time() -> float:
+    """Seconds of a processor, of this process and of the compilers that it ran."""
+    return sum(os.times()[:4])
 
 
 def against_lerobot(args: argparse.Namespace) -> dict[str, Any]:
     networks = build_networks(args)
     steps = network_steps(args, networks)
-    clock = time.process_time if args.cpu_time else time.perf_counter
-    seconds: dict[str, list[float]] = {arm: [] for arm in ARMS}
-    for round_index in range(args.rounds + 1):
+    clock = used_time if args.cpu_time else time.perf_counter
+    seconds: dict[str, list[float]] = {arm: [] for arm in steps}
+    for _ in range(args.rounds + 1):
         for arm, step in steps.items():
             start = clock()
             step()
-            if round_index:  # the first round warms up
-                seconds[arm].append(clock() - start)
+            seconds[arm].append(clock() - start)
+            if len(seconds[arm]) == 1:
+                print(f"{arm:22} first step {seconds[arm][0]:.2f} s", flush=True)
     for network in networks.values():
         network.zero_grad()
-    memory = {arm: peak_memory(networks["lerobot" if arm == "lerobot" else "ours"], steps[arm]) for arm in ARMS}
     result = {}
-    for arm in ARMS:
-        ratios = [a / b for a, b in zip(seconds[arm], seconds["lerobot"], strict=True)]
+    reference = "lerobot" if "lerobot" in steps else next(iter(steps))
+    for arm, (first, *later) in seconds.items():
+        ratios = [a / b for a, b in zip(later, seconds[reference][1:], strict=True)]
         result[arm] = {
-            "seconds": statistics.median(seconds[arm]), "time_ratio": statistics.median(ratios),
-            "time_ratio_range": [min(ratios), max(ratios)],
-            "peak_MiB": memory[arm], "memory_ratio": memory[arm] / memory["lerobot"],
+            "seconds": statistics.median(later), "time_ratio": statistics.median(ratios),
+            "time_ratio_range": [min(ratios), max(ratios)], "first_step_seconds": first,
         }  # fmt: skip
-        print(f"{arm:14}" + "".join(f"{k} {v:9.3f}  " for k, v in result[arm].items() if isinstance(v, float)))
+        if args.device == "cuda" or not arm.endswith(COMPILED):  # live tensors are not seen inside compiled code
+            result[arm]["peak_MiB"] = peak_memory(network_of(arm, networks), steps[arm])
+    for arm, found in result.items():
+        if "peak_MiB" in found and "peak_MiB" in result[reference]:
+            found["memory_ratio"] = found["peak_MiB"] / result[reference]["peak_MiB"]
+        print(f"{arm:22}" + "".join(f"{k} {v:9.3f}  " for k, v in found.items() if isinstance(v, float)))
     return result
 
 
@@ -246,6 +274,10 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, default=1)
     parser.add_argument("--prompt", type=int, default=100, help="prompt tokens; a state of 14 numbers takes some 70")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--arms", nargs="+", choices=ALL_ARMS, help="against LeRobot's: only these")
+    parser.add_argument(
+        "--lerobot-compile-mode", default="max-autotune", help="of torch.compile; LeRobot's is the default"
+    )
     parser.add_argument("--cpu-time", action="store_true", help="time that the process has used, not that has passed")
     parser.add_argument("--flow-samples", type=float, metavar="SECONDS", help="train so long at K = 1, 2, 4, 8")
     parser.add_argument("--output", help="write the numbers to this JSON file")
@@ -255,7 +287,7 @@ def main() -> None:
         result["flow_samples"] = flow_samples(args)
     else:
         result["against_lerobot"] = against_lerobot(args)
-        if args.size != "mid":  # a policy is configured by the sizes that it has
+        if args.size != "mid" and not args.arms:  # a policy is configured by the sizes that it has
             result["micro_batches"] = micro_batches(args)
     if args.output:
         with open(args.output, "w") as file:

@@ -123,9 +123,6 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     depth_keys: dict[str, str] = field(default_factory=dict)
     optional_depth_cameras: list[str] = field(default_factory=list)  # depth cameras that observations may lack
     rig: int | None = None  # of a policy trained on data of several rigs: which one it acts on
-    # LeRobot's rollout sets this from --use_torch_compile. It has no effect: the runner is faster, and compiling takes minutes.
-    compile_model: bool = False
-
     # Recorded about geometry
     calibration: dict[str, CameraCalibration] = field(default_factory=dict)
     arms: dict[str, Arm] = field(default_factory=dict)
@@ -191,6 +188,9 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     )
 
     gradient_checkpointing: bool = False
+    # Compile the layers in training (model/layer_calls.py). No effect on acting, whatever LeRobot's rollout writes here from
+    # --use_torch_compile: the runner is faster there.
+    compile_model: bool = False
     # Samples whose activations are held at once; a larger batch is processed in several goes. 0: the whole batch.
     micro_batch_size: int | None = None
     freeze_vision_encoder: bool = False

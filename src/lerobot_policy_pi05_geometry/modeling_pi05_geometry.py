@@ -50,10 +50,10 @@ from .model.segments import GeometryTokens
 from .training.attention_share import AttentionShare
 from .training.dropout import Cameras, drop
 from .training.lora import always_in_full, peft_targets
-from .training.micro_batches import each_of, require_whole_parameters, rows_of, sum_of
+from .training.micro_batches import each_of, rows_of, sum_of
 from .training.parameter_groups import UpdateSize, new_parameters, parameter_groups
 from .training.progress import TrainingProgress
-from .training.sharding import UNIT_CLASSES
+from .training.sharding import UNIT_CLASSES, require_whole_parameters
 from .weight_files.files import find_file, require_policy_type
 from .weight_files.strict_load import load_strictly
 
@@ -103,6 +103,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self._set_trainable()
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
+        if config.compile_model:
+            self.model.compile_training()
         self.progress = TrainingProgress()
         self._acted_on = 0  # rows of the last observation; 0 before the first
         self._noise_seed = torch.initial_seed()
@@ -193,6 +195,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         """
         if reduction not in ("mean", "none"):
             raise ValueError(f"reduction must be 'mean' or 'none', got {reduction!r}.")
+        if self.config.compile_model and self.training:
+            require_whole_parameters(self, "compile_model")
         size, steps, action_dim = batch[ACTION].shape
         check_actions(batch[ACTION], batch, self.config.action_feature.shape[0])
         anchor_of(batch, self.config.use_relative_actions)  # raises if the processors disagree with the policy
@@ -255,7 +259,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             return parts[0]()
         parameters = [p for p in self.parameters() if p.requires_grad]
         if torch.is_grad_enabled() and parameters:
-            require_whole_parameters(self)
+            require_whole_parameters(self, "micro_batch_size")
             return (each_of if reduction == "none" else sum_of)(parts, parameters)
         losses = [run() for run in parts]
         return torch.cat(losses) if reduction == "none" else torch.stack(losses).sum()

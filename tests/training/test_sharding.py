@@ -138,11 +138,12 @@ def test_a_unit_is_called_and_has_one_dtype(param_dtype):
     assert len(taken) == len(list(policy.parameters()))
 
 
-def test_micro_batches_refuse_sharded_parameters(tmp_path):
+@pytest.mark.parametrize("setting", [{"micro_batch_size": 1}, {"compile_model": True}])
+def test_what_sharded_parameters_do_not_allow_is_refused(tmp_path, setting):
     dist.init_process_group("gloo", init_method=f"file://{tmp_path / 'rendezvous'}", rank=0, world_size=1)
     try:
-        policy = shard(make_policy(micro_batch_size=1).train())
-        with pytest.raises(ValueError, match="FSDP's sharded parameters"):
+        policy = shard(make_policy(**setting).train())
+        with pytest.raises(ValueError, match=f"{next(iter(setting))} does not work with FSDP's sharded parameters"):
             policy(make_batch(2))
     finally:
         dist.destroy_process_group()

@@ -11,15 +11,16 @@ denoising step gives only the suffix and reads the rest from the cache. All thre
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 from transformers import SiglipVisionModel
 
 from .attention import rotary_table
 from .config import NetworkConfig
 from .gemma import GemmaModel, KeysValues
+from .layer_calls import call_layer
 from .precision import store_in
 from .segment_cache import SegmentKVCache
 from .segment_gate import GeometryGate
@@ -62,7 +63,8 @@ class PaliGemmaWithExpert(nn.Module):
         super().__init__()
         self.config = config
         self.dtype = config.dtype
-        self.gradient_checkpointing = False
+        self.gradient_checkpointing = False  # these two are for training mode
+        self.compiled = False
         self.paligemma = Holder(PaliGemmaModel(config))
         self.gemma_expert = Holder(GemmaModel(config.expert, cond_dim=config.expert.width))
         self.language_model.freeze_unread_output()
@@ -106,7 +108,12 @@ class PaliGemmaWithExpert(nn.Module):
     def embed_image(self, images: Tensor) -> Tensor:
         """Images (N, 3, H, W) in [-1, 1] -> (N, patches, W_vlm), in one batch."""
         model = self.paligemma.model
-        return embed_images(model.vision_tower, model.multi_modal_projector, images)
+        return embed_images(model.vision_tower, model.multi_modal_projector, images, self._call_layer)
+
+    def _call_layer(self, layer: nn.Module, *arguments: Any) -> Any:
+        training = self.training
+        checkpointing, compiled = training and self.gradient_checkpointing, training and self.compiled
+        return call_layer(layer, *arguments, checkpointing=checkpointing, compiled=compiled)
 
     def embed_language_tokens(self, tokens: Tensor) -> Tensor:
         """Token ids (B, L) -> (B, L, W_vlm)."""
@@ -158,7 +165,8 @@ class PaliGemmaWithExpert(nn.Module):
             for segment in given:
                 layer = self.segment_model(segment).layers[index]
                 slot = None if past_key_values is None else past_key_values.slot(index, segment)
-                arguments = (
+                hidden[segment], earlier = self._call_layer(
+                    layer,
                     hidden[segment],
                     rotary[segment],
                     masks[segment],
@@ -168,12 +176,6 @@ class PaliGemmaWithExpert(nn.Module):
                     slot,
                     bool(wanted[segment]) or index < depth - 1,
                 )
-                if self.gradient_checkpointing and self.training:
-                    hidden[segment], earlier = checkpoint(
-                        layer, *arguments, use_reentrant=False, preserve_rng_state=False
-                    )
-                else:
-                    hidden[segment], earlier = layer(*arguments)
 
         results: list[Tensor | None] = [None, None, None]
         for segment in given:

@@ -55,9 +55,10 @@ class PI05Pytorch(nn.Module):
     def gradient_checkpointing_enable(self) -> None:
         """Recompute each layer once in the backward pass (a layer then runs twice per training step)."""
         self.paligemma_with_expert.gradient_checkpointing = True
-        self.paligemma_with_expert.paligemma.model.vision_tower.gradient_checkpointing_enable(
-            {"use_reentrant": False, "preserve_rng_state": False}
-        )
+
+    def compile_training(self) -> None:
+        """Compile the layers where they train (layer_calls.py); in evaluation mode they stay as they are."""
+        self.paligemma_with_expert.compiled = True
 
     def embed_prefix(
         self, images: Sequence[Tensor | None], img_masks: Sequence[Tensor], tokens: Tensor, masks: Tensor

@@ -1,5 +1,7 @@
 """SigLIP (from transformers) and the projector into the VLM; all cameras in one batch."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 from transformers import SiglipVisionConfig, SiglipVisionModel
@@ -34,9 +36,17 @@ def build_vision_tower(variant: PaliGemmaVariant, image_size: int) -> SiglipVisi
     )
 
 
-def embed_images(tower: SiglipVisionModel, projector: Projector, images: Tensor) -> Tensor:
-    """Images (N, 3, H, W) in [-1, 1] -> patch embeddings (N, patches, W_vlm)."""
-    weight = tower.vision_model.embeddings.patch_embedding.weight
+def embed_images(
+    tower: SiglipVisionModel, projector: Projector, images: Tensor, call_layer: Callable[..., Tensor]
+) -> Tensor:
+    """Images (N, 3, H, W) in [-1, 1] -> patch embeddings (N, patches, W_vlm).
+
+    call_layer: calls a layer of the tower with its arguments (hidden states, and None for the mask).
+    """
+    vision = tower.vision_model
     if not torch.is_autocast_enabled(images.device.type):
-        images = images.to(weight.dtype)
-    return projector(tower(images).last_hidden_state)
+        images = images.to(vision.embeddings.patch_embedding.weight.dtype)
+    hidden = vision.embeddings(images)
+    for layer in vision.encoder.layers:
+        hidden = call_layer(layer, hidden, None)
+    return projector(vision.post_layernorm(hidden))

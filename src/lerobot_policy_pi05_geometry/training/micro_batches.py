@@ -15,8 +15,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
-from torch.distributed.fsdp import FullyShardedDataParallel
-from torch.distributed.tensor import DTensor
 
 from ..geometry.keys import CALIBRATION_PREFIX
 
@@ -45,16 +43,6 @@ def rows_of(batch: Mapping[str, Any], size: int, rows: slice) -> dict[str, Any]:
         return isinstance(value, list | tuple) and len(value) == size
 
     return {key: value[rows] if per_sample(key, value) else value for key, value in batch.items()}
-
-
-def require_whole_parameters(module: nn.Module) -> None:
-    """Raise ValueError if FSDP shards the parameters of `module`: it expects one backward pass over its units."""
-    sharded = any(isinstance(m, FullyShardedDataParallel) for m in module.modules())
-    if sharded or any(isinstance(p, DTensor) for p in module.parameters()):
-        raise ValueError(
-            "micro_batch_size computes gradients inside the forward pass, which FSDP's sharded parameters do not allow; "
-            "set --policy.micro_batch_size=0 and lower --batch_size, or train with DDP."
-        )
 
 
 class _GradientSums:

@@ -8,7 +8,8 @@ one dtype, so modules that stay in float32 are units of their own.
 from typing import Any
 
 from torch import nn
-from torch.distributed.fsdp import fully_shard
+from torch.distributed.fsdp import FullyShardedDataParallel, fully_shard
+from torch.distributed.tensor import DTensor
 from transformers.models.siglip.modeling_siglip import SiglipEncoderLayer
 
 from ..model.gemma import GemmaLayer
@@ -53,3 +54,16 @@ def shard[P: nn.Module](policy: P, **options: Any) -> P:
         fully_shard(unit, **options)
     fully_shard(policy, **options)
     return policy
+
+
+def require_whole_parameters(module: nn.Module, setting: str) -> None:
+    """Raise ValueError if FSDP shards the parameters of `module`, which `setting` does not allow.
+
+    FSDP expects one backward pass over its units, and gathers them in hooks that a compiled layer would not run.
+    """
+    sharded = any(isinstance(m, FullyShardedDataParallel) for m in module.modules())
+    if sharded or any(isinstance(p, DTensor) for p in module.parameters()):
+        raise ValueError(
+            f"{setting} does not work with FSDP's sharded parameters; leave --policy.{setting} out and, if memory is short, "
+            "lower --batch_size, or train with DDP."
+        )
