@@ -247,6 +247,13 @@ def test_on_cuda_pure_bf16_layer_norms_are_float32():
     assert cuda - cpu > 0.5 * norms * 2 * seen
 
 
+def test_on_cuda_pure_bf16_is_planned_with_gradient_checkpointing():
+    """Layers that are run again in the backward pass compute as they did in the forward pass."""
+    changes = {"dtype": "bfloat16", "param_dtype": "bfloat16"}
+    kept, again = (fake(**changes, gradient_checkpointing=on).training(load(8, target="cuda")) for on in (False, True))
+    assert 0 < again.activations < kept.activations
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("case", range(3))

@@ -3,19 +3,18 @@
 The policy is built without weights, its parameters become fake tensors on the CPU, and the real network runs on them, forward
 and backward. The fake tensors are on the CPU and not on "cuda", so that every machine gives the same answer: PyTorch switches
 autocast off where it finds no CUDA. Attention counts as PyTorch's fused CPU kernel, which like CUDA's fused kernels keeps its
-output and one number per query. `CudaAutocast` has the differences of CUDA's autocast.
+output and one number per query. `as_cudas_autocast` has the difference of CUDA's autocast.
 """
 
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from accelerate import init_empty_weights
 from torch import Tensor
 from torch._subclasses import FakeTensorMode
-from torch.overrides import TorchFunctionMode
 
 from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..geometry.da3 import Da3Backbone, Da3Encoder, Da3Source, Da3Variant
@@ -62,14 +61,12 @@ class _Step(NamedTuple):
     batch: int
 
 
-class CudaAutocast(TorchFunctionMode):
-    """The difference between CUDA's autocast and the CPU's for this network: layer norms return float32."""
+def as_cudas_autocast(norm: torch.nn.LayerNorm, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """The difference between CUDA's autocast and the CPU's for this network: layer norms compute and return float32.
 
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func is torch.nn.functional.layer_norm and torch.is_autocast_enabled("cpu"):
-            args = [a.float() if isinstance(a, Tensor) else a for a in args]
-            kwargs = {k: a.float() if isinstance(a, Tensor) else a for k, a in (kwargs or {}).items()}
-        return func(*args, **(kwargs or {}))
+    A hook before a layer norm. It also acts where checkpointing runs a layer again in the backward pass.
+    """
+    return tuple(x.float() for x in inputs) if torch.is_autocast_enabled("cpu") else inputs
 
 
 class FakePolicy:
@@ -198,7 +195,8 @@ class FakePolicy:
         """A counter of fake tensors that is active until the stack is closed and has counted the weights."""
         stack.enter_context(self.mode)
         if target == "cuda":
-            stack.enter_context(CudaAutocast())
+            for norm in (m for m in self.policy.modules() if isinstance(m, torch.nn.LayerNorm)):
+                stack.callback(norm.register_forward_pre_hook(as_cudas_autocast).remove)
         counter = MemoryCounter(_block(target))
         counter.label([*self.policy.parameters(), *self.policy.buffers()], "weights")
         encoder = self._encoder()
