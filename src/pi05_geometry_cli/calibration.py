@@ -41,31 +41,61 @@ def board(
 @calibrate.command()
 def camera(
     name: Annotated[str, typer.Option("--camera", help="Its name in the robot's configuration.")],
-    serial: Annotated[str, typer.Option(help="Serial number of the RealSense (lerobot-find-cameras realsense).")],
+    serial: Annotated[str | None, typer.Option(help="Of a RealSense (lerobot-find-cameras realsense).")] = None,
+    dataset_root: Annotated[
+        Path | None, typer.Option("--dataset.root", help="Of any camera: a recording in which it sees the board.")
+    ] = None,
+    dataset_repo_id: RepoId = "local/dataset",
+    board: BoardText = DEFAULT_BOARD,
     width: Annotated[int, typer.Option(help="As in the robot's configuration, before rotation.")] = 640,
     height: Annotated[int, typer.Option(help="As in the robot's configuration, before rotation.")] = 480,
     fps: Annotated[int, typer.Option(help="As in the robot's configuration.")] = 30,
     rotation: Annotated[int, typer.Option(help="As in the robot's configuration: 0, 90, 180 or 270 (its -90).")] = 0,
     file: File = Path("calibration.json"),
 ) -> None:
-    """Read intrinsics, depth scale and the place of the colour stream from a connected RealSense."""
+    """Read what a connected RealSense knows (--serial), or find intrinsics from images of a board (--dataset.root)."""
+    from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
+
+    if (serial is None) == (dataset_root is None):
+        raise ValueError("Give either --serial of a RealSense, or --dataset.root of a recording with the board.")
+    calibration = _read(file)
+    before = calibration.cameras.get(name)
+    if serial is not None:
+        calibration.cameras[name], told = _read_realsense(serial, width, height, fps, rotation, before)
+    else:
+        assert dataset_root is not None
+        calibration.cameras[name], told = _see_board(name, dataset_root, dataset_repo_id, board, before)
+    write_calibration_file(file, calibration)
+    console.print(f"{name}: {told} Wrote [bold]{file}[/bold].")
+
+
+def _read_realsense(serial: str, width: int, height: int, fps: int, rotation: int, before):
     from dataclasses import replace
 
-    from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
     from lerobot_policy_pi05_geometry.robot.realsense import read_camera
 
-    calibration = _read(file)
     found = read_camera(serial, width, height, fps, rotation % 360)
-    before = calibration.cameras.get(name)
     if before is not None:  # where it stands is still true
         found = replace(found, extrinsics=before.extrinsics, mount=before.mount)
-    calibration.cameras[name] = found
-    write_calibration_file(file, calibration)
-    console.print(
-        f"{name}: focal lengths {found.intrinsics[0]:.1f} and {found.intrinsics[1]:.1f} px of {found.size[0]} x "
-        f"{found.size[1]}, one "
-        f"count of depth is {found.depth_scale * 1e3:g} mm. Wrote [bold]{file}[/bold]."
+    told = (
+        f"focal lengths {found.intrinsics[0]:.1f} and {found.intrinsics[1]:.1f} px of {found.size[0]} x {found.size[1]}, one "
+        f"count of depth is {found.depth_scale * 1e3:g} mm."
     )
+    return found, told
+
+
+def _see_board(name: str, root: Path, repo_id: str, board: str, before):
+    from lerobot_policy_pi05_geometry.robot.board import Board
+    from lerobot_policy_pi05_geometry.robot.intrinsics import read_intrinsics, with_intrinsics
+
+    found = read_intrinsics(root, repo_id, name, Board.parse(board))
+    fx, fy, cx, cy = found.intrinsics
+    told = (
+        f"focal lengths {fx:.1f} and {fy:.1f} px, centre {cx:.1f}, {cy:.1f} of {found.size[0]} x {found.size[1]}, each known to "
+        f"{max(found.spread):.1f} px; {found.views} views, {found.residual:.2f} px remain. The lens bends the image by up to "
+        f"{found.bend:.1f} px, which hand-eye calibration takes into account and points of depth do not."
+    )
+    return with_intrinsics(name, before, found), told
 
 
 @calibrate.command()
