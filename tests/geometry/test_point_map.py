@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
-from lerobot_policy_pi05_geometry.geometry.point_map import transform, unproject
+from lerobot_policy_pi05_geometry.geometry.point_map import placed_points, transform, unproject
 from lerobot_policy_pi05_geometry.geometry.rigid import check_rigid
 from tests.geometry.scenes import calibrated, generator, project, random_pose, seeds, uniform
 
@@ -38,6 +38,19 @@ def test_intrinsics_and_poses_may_differ_within_a_batch(seed):
     for row in range(2):
         alone = transform(poses[row], unproject(depth[row : row + 1], intrinsics[row]))
         torch.testing.assert_close(together[row : row + 1], alone)
+
+
+@given(seed=seeds, same_intrinsics=st.booleans(), same_pose=st.booleans())
+def test_points_in_one_pass_are_those_in_two(seed, same_intrinsics, same_pose):
+    """In the camera frame too; where all rows share a camera, and where each has its own."""
+    random = generator(seed)
+    depth = uniform(random, 0.2, 4.0, 2, 1, 5, 6)
+    intrinsics = uniform(random, 3.0, 9.0, 2, 4)
+    poses = torch.stack([random_pose(random), random_pose(random)])
+    intrinsics, poses = intrinsics[0] if same_intrinsics else intrinsics, poses[0] if same_pose else poses
+    camera = unproject(depth, intrinsics)
+    torch.testing.assert_close(placed_points(depth, intrinsics, None), camera)
+    torch.testing.assert_close(placed_points(depth, intrinsics, poses), transform(poses, camera), atol=1e-5, rtol=1e-5)
 
 
 @given(seed=seeds)

@@ -21,6 +21,25 @@ def unproject(depth: Tensor, intrinsics: Tensor) -> Tensor:
     return torch.cat([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], dim=1)
 
 
+def placed_points(depth: Tensor, intrinsics: Tensor, pose: Tensor | None) -> Tensor:
+    """Depth to points in the frame that a pose leads to: `transform(pose, unproject(depth, intrinsics))` in one pass over pixels.
+
+    depth, intrinsics: as in `unproject`. pose: (4, 4) or (B, 4, 4), or None for the camera frame. Returns (B, 3, H, W) metres.
+
+    A point is the depth times a direction, which depends on column and row, plus the camera's place. As in `transform`, these
+    are products of numbers.
+    """
+    height, width = depth.shape[-2:]
+    pose = torch.eye(4, device=depth.device) if pose is None else pose
+    turn, place = pose.to(depth)[..., :3, :3], pose.to(depth)[..., :3, 3].reshape(-1, 3, 1, 1)
+    x, y, z = (axis.reshape(-1, 3, 1, 1) for axis in turn.unbind(-1))  # of the camera, in the frame
+    fx, fy, cx, cy = (value.reshape(-1, 1, 1, 1) for value in intrinsics.to(depth).unbind(-1))
+    u = torch.arange(width, device=depth.device, dtype=depth.dtype)[None, :]
+    v = torch.arange(height, device=depth.device, dtype=depth.dtype)[:, None]
+    directions = (x * ((u - cx) / fx) + z) + y * ((v - cy) / fy)  # (1 or B, 3, H, W)
+    return torch.addcmul(place, directions, depth)
+
+
 def as_pose(pose: Tensor, key: str) -> Tensor:
     """A pose as it stands in a batch -> (4, 4) for the whole batch, or (B, 4, 4).
 

@@ -15,7 +15,7 @@ from .depth import check_measured, check_unit, to_metres
 from .depth_augmentation import DepthAugmentation, augment_depth, jittered
 from .keys import AUGMENTATION_KEY, RAW_STATE, depth_key, extrinsics_key, find_depth_key
 from .placed_camera import PlacedCamera
-from .point_map import as_pose, transform, unproject
+from .point_map import as_pose, placed_points
 from .rigid import check_rigid
 from .source import GeometryFeatures, GeometrySource
 
@@ -123,13 +123,14 @@ class RgbdSource(GeometrySource):
         number = self.cameras.index(camera)
         if drawn is not None:
             depth, valid = augment_depth(self.augmentation, depth, valid, drawn, number, self.max_depth)
-        points = unproject(depth, placed.intrinsics(rows, depth.device))
+        intrinsics, pose = placed.intrinsics(rows, depth.device), None
         if self.base_frame:
             pose = self._pose(camera, batch, rows, depth.device, check)
             if drawn is not None:
                 pose = jittered(self.augmentation, pose, drawn, number)
-            points = transform(pose, points)
-        valid = valid & points.isfinite().all(dim=1, keepdim=True)  # with a pose of NaN no point is known
+            known = pose.isfinite().flatten(-2).all(dim=-1)  # with a pose of NaN no point is known
+            valid = valid & known.reshape(-1, 1, 1, 1)
+        points = placed_points(depth, intrinsics, pose)
         return cell_points(points, valid, self.grid) if self.points else cell_statistics(points, valid, self.grid)
 
     def _pose(
@@ -169,14 +170,20 @@ def cell_statistics(points: Tensor, valid: Tensor, grid: int) -> GeometryFeature
 
     Returns features (B, grid², C), zeros where a cell has no valid pixel, and validity (B, grid²).
     """
-    weight = valid.to(points.dtype)
     points = points.masked_fill(~valid, 0.0)
-    fraction = F.adaptive_avg_pool2d(weight, grid)  # (B, 1, g, g)
+    fraction = _cell_means(valid.to(points.dtype), grid)  # (B, 1, g, g)
     share = fraction.clamp_min(torch.finfo(points.dtype).tiny)
-    mean = F.adaptive_avg_pool2d(points, grid) / share
-    square = F.adaptive_avg_pool2d(points.square(), grid) / share
+    mean = _cell_means(points, grid) / share
+    square = _cell_means(points.square_(), grid) / share
     spread = (square - mean.square()).clamp_min(0.0).sqrt()
     angles = torch.cat([mean * (2 * torch.pi / wavelength) for wavelength in WAVELENGTHS], dim=1)
     features = torch.cat([mean, spread, fraction, angles.sin(), angles.cos()], dim=1)
     seen = (fraction > 0).flatten(2)  # (B, 1, G)
     return GeometryFeatures(features.flatten(2).masked_fill(~seen, 0.0).mT, seen[:, 0])
+
+
+def _cell_means(values: Tensor, grid: int) -> Tensor:
+    """Means over grid x grid cells, (B, C, H, W) -> (B, C, grid, grid): of rows first where all have one size."""
+    if values.shape[-1] % grid or values.shape[-2] % grid:
+        return F.adaptive_avg_pool2d(values, grid)
+    return values.unflatten(-1, (grid, -1)).mean(dim=-1).unflatten(-2, (grid, -1)).mean(dim=-2)
