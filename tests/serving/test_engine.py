@@ -10,9 +10,9 @@ from lerobot_policy_pi05_geometry.serving.inputs import Inputs
 from lerobot_policy_pi05_geometry.serving.limits import Limits, RequestError
 from lerobot_policy_pi05_geometry.serving.noise import request_noise
 from lerobot_policy_pi05_geometry.serving.session import Session
-from tests.entry_points import ACTION_DIM, CHUNK
+from tests.entry_points import ACTION_DIM, CHUNK, WRIST_DEPTH, WRIST_POSE, without
 
-from .running import load, local_chunk, make_request
+from .running import load, local_chunk, make_request, observation_of
 
 SHAPE = (CHUNK, 8)
 
@@ -135,6 +135,31 @@ def test_jobs_share_a_batch_only_with_the_same_keys_shapes_and_guidance():
     same, *different = (jobs_of(loaded, [r])[0].group for r in (other, smaller, floats, posed))
     assert same == jobs_of(loaded, [base])[0].group
     assert all(group != same for group in different)
+
+
+@pytest.mark.parametrize("lost", [["depth"], ["depth", "extrinsics"], ["extrinsics"]])
+def test_a_camera_that_has_failed_is_masked_whoever_begins_meanwhile(lost):
+    """As in a local run that has seen the camera. Another robot's episode, whose camera never measured, changes nothing."""
+    loaded, session = load(), Session(name="robot")
+    engine, inputs = PolicyEngine(loaded), Inputs(loaded.policy.config, Limits())
+    (job,) = jobs_of(loaded, [make_request()], [session])
+    note_answer(session, job.request, engine.run([job], 1)[0])
+    covered = make_request(2)
+    covered["depth"]["wrist"] = np.zeros_like(covered["depth"]["wrist"])
+    engine.run(jobs_of(loaded, [covered]), 1)
+    failed = make_request(1)
+    for what in lost:
+        del failed[what]["wrist"]
+    job = make_job(session, inputs.read(failed, session.seen), 7, SHAPE)
+    (answer,) = engine.run([job], 1)
+
+    policy = load().policy
+    batch, keys = observation_of(make_request(1)), {"depth": WRIST_DEPTH, "extrinsics": WRIST_POSE}
+    with torch.no_grad():
+        policy.predict_action_chunk(loaded.preprocess(batch), noise=job.noise[None])
+        batch = without(batch, *(keys[what] for what in lost))
+        actions = loaded.postprocess(policy.predict_action_chunk(loaded.preprocess(batch), noise=job.noise[None]))
+    np.testing.assert_array_equal(answer.actions, actions[0].numpy())
 
 
 def test_an_implausible_unit_is_the_requests_error_at_the_start_of_an_episode():

@@ -80,6 +80,7 @@ WRONG = {
     "twice": (lambda r: r | {"observation.state": r["state"]}, f"{STATE} twice"),
     "unknown": (lambda r: r | {"images": r["images"] | {"left": image}}, "has images/left, which .* does not know; it takes"),
     "unknown and long": (lambda r: r | {"x" * 500: 1}, r"has x{77}\.\.\., which"),
+    "unknown on two lines": (lambda r: r | {"left\n\x1b[2J": 1}, r"has left\?\?\[2J, which"),
     "bytes as key": (lambda r: r | {b"a": 1}, "must be text"),
     "bytes as inner key": (lambda r: r | {"images": {b"front": image}}, "keys in images must be text"),
     "image of floats": (lambda r: change(r, "images", "front", value=image.astype("f8")), "dtype <f8; expected .*u1 or <f4"),
@@ -88,7 +89,9 @@ WRONG = {
     "image without channels": (lambda r: change(r, "images", "front", value=image[..., 0]), r"shape \(30, 40\)"),
     "image with 4 channels": (lambda r: change(r, "images", "front", value=np.zeros((30, 40, 4), "u1")), "shape"),
     "image of a batch": (lambda r: change(r, "images", "front", value=image[None]), r"shape \(1, 30, 40, 3\)"),
-    "huge image": (lambda r: change(r, "images", "front", value=np.zeros((1, 5000, 3), "u1")), "shape"),
+    "huge image": (lambda r: change(r, "images", "front", value=np.zeros((1000, 5000, 3), "u1")), "sides must be 8 to 4096"),
+    "low image": (lambda r: change(r, "images", "front", value=np.zeros((3, 7, 40), "u1")), "has 7 x 40 pixels; sides must be"),
+    "thin image": (lambda r: change(r, "images", "front", value=np.zeros((80, 9, 3), "f4")), "one at most 8 times the other"),
     "image of numbers": (lambda r: change(r, "images", "front", value=[1, 2]), "images/front is no array"),
     "8-bit depth": (lambda r: change(r, "depth", "front", value=depth.astype("u1")), "dtype |u1; expected .* mm"),
     "small depth": (lambda r: change(r, "depth", "front", value=depth[1:]), r"shape \(17, 24\); expected \(18, 24\)"),
@@ -127,7 +130,12 @@ def test_a_depth_camera_may_fail_once_it_has_been_seen():
     inputs, request = make_inputs(), without(make_request(), "depth", "extrinsics")
     request["depth"] = {"front": depth}
     found = inputs.read(request, seen={WRIST_DEPTH, WRIST_POSE})
-    assert set(found.observation) == {FRONT, WRIST, FRONT_DEPTH, STATE}
+    assert set(found.observation) == set(inputs.read(make_request()).observation)
+    assert not found.observation[WRIST_DEPTH].any()  # nothing is measured
+    blind = inputs.read(
+        without(make_request(), "extrinsics"), seen={WRIST_POSE}
+    )  # a pose is missing: depth has no place
+    assert not blind.observation[WRIST_DEPTH].any()
     with pytest.raises(RequestError, match=f"has no {FRONT}"):
         inputs.read(without(request, "images"), seen={FRONT, WRIST, WRIST_DEPTH, WRIST_POSE})
 

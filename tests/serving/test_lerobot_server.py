@@ -258,6 +258,39 @@ def test_an_observation_that_never_ends_is_bounded(engine):
         refused(lambda: client.stub.SendObservations(pieces(1, False)), INVALID, "has no end")
 
 
+def test_an_observation_that_stops_halfway_holds_its_call_for_a_while_only(port, monkeypatch):
+    monkeypatch.setattr(grpc_server, "_SENDING", 1.0)
+    client, other, stop = Client(port).begin(), Client(port).begin(), threading.Event()
+
+    def halfway():
+        yield services_pb2.Observation(transfer_state=services_pb2.TRANSFER_BEGIN, data=b"x")
+        stop.wait(30)
+
+    hanging = client.stub.SendObservations.future(halfway())
+    busy = grpc.StatusCode.RESOURCE_EXHAUSTED
+
+    def second() -> None:  # the first may not have begun
+        for _ in range(100):
+            client.send(observe())
+            time.sleep(0.01)
+
+    refused(second, busy, "One call of SendObservations at a time")
+    other.send(observe(1, value=0.5))
+    assert other.actions()[0].get_action()[0] == 0.5
+    with pytest.raises(grpc.RpcError):
+        hanging.result(20)
+    stop.set()
+    end = time.monotonic() + 10
+    while True:
+        try:
+            client.send(observe(2, value=0.25))
+            break
+        except grpc.RpcError:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+    assert client.actions()[0].get_action()[0] == 0.25
+
+
 def test_the_client_silent_for_longest_makes_room(engine, monkeypatch):
     monkeypatch.setattr(grpc_server, "_CLIENTS", 2)
     with serving(fake_posed(engine)) as port:

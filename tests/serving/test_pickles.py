@@ -255,8 +255,10 @@ def test_the_hostile_pickles_are_hostile():
     MARKER.unlink()
 
 
-def test_one_storage_named_a_thousand_times_is_no_thousand_storages():
-    stored = storage(200, claim=None)
+@pytest.mark.parametrize(("count", "rest"), [(200, b""), (1, b"x" * 1000)], ids=["large", "long"])
+def test_one_storage_named_a_thousand_times_is_no_thousand_storages(count, rest):
+    """Neither the memory of them, nor the time to read each."""
+    stored = storage(count, claim=None) + rest
     name = named("torch.storage", "_load_from_bytes") + b"\x94"
     data = b"B" + struct.pack("<I", len(stored)) + stored + b"\x94"
     message = unpickling(b"]" + name + data + b"\x85\x94R" + b"a" + b"h\0h\2Ra" * 1000)

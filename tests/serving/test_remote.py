@@ -231,6 +231,14 @@ def test_a_robot_with_other_joints_is_refused():
             remote(running.url, n_action_steps=7)
 
 
+def test_another_server_of_openpis_protocol_is_told_apart():
+    with (
+        serving(fake_server(FakeEngine())) as running,
+        pytest.raises(ValueError, match="a server of openpi's protocol, but not `pi05-geometry serve`"),
+    ):
+        remote(running.url)
+
+
 def test_its_configuration_is_saved_without_the_key(tmp_path, monkeypatch):
     monkeypatch.setenv("PI05_GEOMETRY_API_KEY", "k" * 32)
     PI05GeometryRemoteConfig(server="ws://x:1")._save_pretrained(tmp_path)

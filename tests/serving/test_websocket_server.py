@@ -1,5 +1,6 @@
 """The server on a socket: who may connect, what is answered, and what one client can do to another."""
 
+import contextlib
 import socket
 import threading
 import time
@@ -185,12 +186,15 @@ def test_only_loopback_needs_no_key(tmp_path, monkeypatch):
     path = tmp_path / "key"
     path.write_text("a" * 20 + "\n")
     assert read_key(path) == "a" * 20
-    for content in ("short", "with a\nnewline in the middle", "ä" * 20):
+    for content in ("", "\n", "short", "with a\nnewline in the middle", "ä" * 20):
         path.write_text(content)
         with pytest.raises(ValueError, match="at least 16 printable"):
             read_key(path)
     with pytest.raises(FileNotFoundError, match="is not there; write a key"):
         read_key(tmp_path / "none")
+    monkeypatch.setenv("PI05_GEOMETRY_API_KEY", "")  # a secret that was not mounted
+    with pytest.raises(ValueError, match="at least 16 printable"):
+        read_key(None)
 
 
 def test_sessions_are_bounded_and_come_back():
@@ -205,6 +209,25 @@ def test_sessions_are_bounded_and_come_back():
         third = PolicyClient(running.url)
         assert third.infer(mine(3))["actions"][0, 0] == 3
         second.close(), third.close()
+
+
+def test_sessions_are_bounded_when_many_come_at_once():
+    with serving(fake_server(FakeEngine(), limits=Limits(sessions=2))) as running:
+        found, barrier = [], threading.Barrier(12)
+
+        def come() -> None:
+            barrier.wait()
+            with contextlib.suppress(ServerLostError):
+                found.append(PolicyClient(running.url))
+
+        threads = [threading.Thread(target=come) for _ in range(12)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(30)
+        assert len(found) == len(running.server._sessions) == 2
+        for client in found:
+            client.close()
 
 
 # --- what one client can do to another ----------------------------------------------------------------------------

@@ -125,6 +125,11 @@ def test_closing_finishes_what_waits_and_takes_no_more(engine, service):
 
 
 def test_it_is_unhealthy_after_failures_that_no_request_is_to_blame_for(engine, service):
+    def broken():
+        raise RuntimeError("the device is gone")
+
+    service.worker._warm_up = broken
+
     def fail(task):
         with pytest.raises((RuntimeError, RequestError)):
             service.worker.submit(job(service, task=task)).result(5)
@@ -138,9 +143,21 @@ def test_it_is_unhealthy_after_failures_that_no_request_is_to_blame_for(engine, 
     for _ in range(3):
         assert service.worker.healthy
         fail("broken")
-    assert not service.worker.healthy
+    while service.worker.healthy:  # it is asked to warm up after the answer
+        time.sleep(0.01)
     service.worker.submit(job(service)).result(5)
     assert service.worker.healthy
+
+
+def test_one_client_cannot_make_it_unhealthy(service):
+    """Requests that fail are theirs as long as the policy's own one does not."""
+    for _ in range(7):
+        with pytest.raises(RuntimeError):
+            service.worker.submit(job(service, task="broken")).result(5)
+    end = time.monotonic() + 10
+    while not service.worker.healthy:  # until it has warmed up after the last answer
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 def test_nothing_is_answered_before_warming_up_and_what_it_raises_is_told(engine):

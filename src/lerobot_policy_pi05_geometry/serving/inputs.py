@@ -23,7 +23,7 @@ from lerobot.utils.constants import OBS_STATE
 from ..configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
 from ..geometry.camera import CameraCalibration
 from ..geometry.keys import CALIBRATION_PREFIX, DEPTH_SUFFIX, IMAGE_PREFIX, depth_key, extrinsics_key, is_geometry_key
-from .limits import Limits, RequestError
+from .limits import Limits, RequestError, shown
 from .rigs import Rigs
 
 _FLOATS = ("<f4", "<f8")
@@ -118,19 +118,32 @@ class Inputs:
                 observation[key] = self._array(self.expected[key], name, value)
         rig = self.rigs.take(rest, rig)
         self.rigs.require(rig)
-        missing = [k for k, e in self.expected.items() if e.required and k not in observation]
-        for key in missing:
-            if not (is_geometry_key(key) and key in seen):
-                raise RequestError(f"The request has no {key}; expected {_describe(self.expected[key])}.")
+        self._complete(observation, seen)
         task = self._task(rest)
         noise = self._noise(rest.pop("noise", None))
         guidance = self._guidance({name: rest.pop(name) for name in GUIDANCE_KEYS if name in rest})
         if rest:
             raise RequestError(
-                f"The request has {_short(next(iter(rest)))}, which this policy does not know; it takes "
+                f"The request has {shown(next(iter(rest)))}, which this policy does not know; it takes "
                 f"{', '.join(self.expected)} and prompt."
             )
         return Request(observation, task, guidance, noise, rig)
+
+    def _complete(self, observation: dict[str, np.ndarray], seen: Iterable[str]) -> None:
+        """Put depth without a measurement where a camera has failed, which the policy masks.
+
+        It also masks a camera whose depth is missing, but only if it has seen it since its last reset; another session's
+        episode may have reset it.
+        """
+        for key, entry in self.expected.items():
+            if not entry.required or key in observation:
+                continue
+            if not is_geometry_key(key) or key not in seen:
+                raise RequestError(f"The request has no {key}; expected {_describe(entry)}.")
+            if key.startswith(CALIBRATION_PREFIX):
+                observation[key] = np.eye(4, dtype=np.float32)
+                key = depth_key(key.removeprefix(CALIBRATION_PREFIX).removesuffix(".extrinsics"))
+            observation[key] = np.zeros(self.expected[key].shape, dtype=np.float32)
 
     def key_of(self, name: str) -> str | None:
         """The key that a name in a request stands for; None for one that is not expected."""
@@ -143,11 +156,12 @@ class Inputs:
             raise RequestError(f"{name} has dtype {value.dtype.str}; expected {_describe(entry)}.")
         value = _without_channel(value, entry)
         fits = value.ndim == len(entry.shape) and all(
-            got == want or (want == 0 and 0 < got <= self._limits.image_side)
-            for got, want in zip(value.shape, entry.shape, strict=True)
+            want in (0, got) for got, want in zip(value.shape, entry.shape, strict=True)
         )
         if not fits:
             raise RequestError(f"{name} has shape {value.shape}; expected {_describe(entry)}.")
+        if entry.shape == _IMAGE:
+            self._check_size(name, *value.shape[:2])
         if value.dtype.kind == "f" and not entry.key.endswith(DEPTH_SUFFIX):
             value = value.astype(np.float32)
             if not np.isfinite(value).all():
@@ -155,6 +169,15 @@ class Inputs:
             if entry.shape == _IMAGE and (value.min() < 0 or value.max() > 1):
                 raise RequestError(f"{name} is a float image with values outside 0 to 1; send those, or uint8.")
         return value
+
+    def _check_size(self, name: str, height: int, width: int) -> None:
+        """Refuse images of which nothing is left when they are scaled to the policy's square."""
+        (low, high), ratio = self._limits.image_sides, self._limits.image_ratio
+        shorter, longer = sorted((height, width))
+        if shorter < low or longer > high or longer > ratio * shorter:
+            raise RequestError(
+                f"{name} has {height} x {width} pixels; sides must be {low} to {high}, and one at most {ratio} times the other."
+            )
 
     def _task(self, rest: dict[str, Any]) -> str:
         given = [rest.pop(name) for name in _TASKS if name in rest]
@@ -259,7 +282,3 @@ def _without_channel(value: np.ndarray, entry: Input) -> np.ndarray:
 def _describe(entry: Input) -> str:
     shape = "(H, W, 3)" if entry.shape == _IMAGE else entry.shape
     return f"{shape} of {' or '.join(entry.dtypes)}, {entry.unit}"
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= 80 else name[:77] + "..."

@@ -11,14 +11,15 @@ KEY_LENGTH = 16
 def read_key(path: Path | None) -> str | None:
     """The key in a file, or in the environment variable PI05_GEOMETRY_API_KEY; None if neither is there.
 
-    Not an option of the command: every user of a machine sees the commands that run. Raises ValueError for one that is too short.
+    Not an option of the command: every user of a machine sees the commands that run. Raises ValueError for one that is too short;
+    an empty one too, since a secret that was not mounted must not open the server to everyone.
     """
     if path is not None and not path.is_file():
         raise FileNotFoundError(
             f"Key file {path} is not there; write a key of at least {KEY_LENGTH} characters into it."
         )
     given = os.environ.get(KEY_VARIABLE) if path is None else path.read_text()
-    if not given:
+    if given is None:
         return None
     key = given.strip()
     if len(key) < KEY_LENGTH or not key.isascii() or not key.isprintable():

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 MIB = 2**20
+PROTOCOL = "openpi-websocket/1"  # what metadata of this server says
 
 
 class RequestError(ValueError):
@@ -15,6 +16,12 @@ class BusyError(RequestError):
 
 class FailedError(RequestError):
     """The server failed, and the request is not to blame; what happened is in the server's log."""
+
+
+def shown(text: str, length: int = 80) -> str:
+    """A text that may be a client's, as it may stand in an answer and in the log: short, and nothing in it ends a line."""
+    text = text if len(text) <= length else text[: length - 3] + "..."
+    return "".join(character if character.isprintable() else "?" for character in text)
 
 
 @dataclass(frozen=True)
@@ -30,6 +37,7 @@ class Limits:
     arrays: int = 64
     dimensions: int = 4  # of an array
     text: int = 4096  # bytes of a string
-    image_side: int = 4096  # pixels
+    image_sides: tuple[int, int] = (8, 4096)  # pixels
+    image_ratio: int = 8  # of an image's longer side to its shorter one
     sessions: int = 64
     queue: int = 64  # requests that wait

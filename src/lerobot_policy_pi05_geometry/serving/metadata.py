@@ -6,8 +6,7 @@ from lerobot.configs import RTCAttentionSchedule
 
 from .engine import PolicyEngine
 from .inputs import Inputs
-
-PROTOCOL = "openpi-websocket/1"
+from .limits import PROTOCOL
 
 
 def describe(engine: PolicyEngine, inputs: Inputs, seed: int, version: str) -> dict[str, Any]:

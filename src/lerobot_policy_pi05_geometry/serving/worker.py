@@ -13,11 +13,11 @@ from concurrent.futures import Future
 from typing import NamedTuple, Protocol
 
 from .engine import Answer, Job
-from .limits import BusyError, RequestError
+from .limits import BusyError, RequestError, shown
 
 logger = logging.getLogger(__name__)
 
-_UNHEALTHY_AFTER = 3  # failures in a row that are not the request's fault
+_UNHEALTHY_AFTER = 3  # failures in a row; then warming up again decides whether the requests or the policy are to blame
 
 
 class Engine(Protocol):
@@ -35,8 +35,8 @@ class _Waiting(NamedTuple):
 class BatchWorker:
     """Runs an engine's batches.
 
-    sizes: of batches, ascending; a batch is filled up to the next of them. queue: requests that may wait. warm_up: called once
-    in the thread before it answers anything.
+    sizes: of batches, ascending; a batch is filled up to the next of them. queue: requests that may wait. warm_up: called in
+    the thread before it answers anything, and after failures, to see whether it still works.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class BatchWorker:
 
     @property
     def healthy(self) -> bool:
-        """Warm, and not in a row of failures that no request can be blamed for, as of a GPU that is gone."""
+        """Warm, and not in a row of failures that warming up has too, as of a GPU that is gone."""
         return self._started.done() and self._failures < _UNHEALTHY_AFTER and self._thread.is_alive()
 
     def submit(self, job: Job) -> "Future[Answer]":
@@ -145,8 +145,18 @@ class BatchWorker:
 
     def _fail(self, waiting: _Waiting, error: Exception) -> None:
         if isinstance(error, ValueError):  # the policy's own sentence about an observation
-            told = error if isinstance(error, RequestError) else RequestError(str(error).partition("\n")[0][:500])
+            told = error if isinstance(error, RequestError) else RequestError(shown(str(error).partition("\n")[0], 500))
             waiting.future.set_exception(told)
             return
-        self._failures += 1
         waiting.future.set_exception(error)
+        self._failures += 1
+        if self._failures >= _UNHEALTHY_AFTER and self._warms_up():
+            self._failures = 0  # the policy is well: it was the requests after all
+
+    def _warms_up(self) -> bool:
+        try:
+            self._warm_up()
+        except Exception as error:  # any: the question is whether it can
+            logger.error("The policy fails on its own warm-up too: %s", error)
+            return False
+        return True

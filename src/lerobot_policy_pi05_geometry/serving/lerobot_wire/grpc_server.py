@@ -35,6 +35,7 @@ logger = logging.getLogger(__name__)
 _MESSAGE_BYTES = 4 * MIB  # robot_client sends an observation in pieces of 2 MiB
 _INSTRUCTION_BYTES = 1 * MIB
 _CLIENTS = 16  # each holds up to two threads: one sends, one waits for actions
+_SENDING = 30.0  # seconds that an observation may take to arrive; its call holds a thread
 _WAIT = 2.0  # seconds that GetActions waits for an observation, before it answers with nothing
 
 
@@ -47,6 +48,7 @@ class _Client:
     changed: threading.Condition = field(default_factory=threading.Condition)
     latest: tuple[Request, float, int] | None = None  # an observation that waits, its time and its step
     asking: threading.Lock = field(default_factory=threading.Lock)
+    sending: threading.Lock = field(default_factory=threading.Lock)
     answered: deque[int] = field(default_factory=lambda: deque(maxlen=1000))  # steps
 
 
@@ -81,6 +83,10 @@ class LeRobotServicer(services_pb2_grpc.AsyncInferenceServicer):
 
     def SendObservations(self, request_iterator: Iterator[Any], context: grpc.ServicerContext) -> Any:  # noqa: N802
         client = self._client(context)
+        if not client.sending.acquire(blocking=False):
+            _refuse(context, BusyError("One call of SendObservations at a time."))
+        late = threading.Timer(_SENDING, context.cancel)
+        late.start()
         try:
             if client.robot is None:
                 raise RequestError("Send policy instructions first.")
@@ -89,6 +95,9 @@ class LeRobotServicer(services_pb2_grpc.AsyncInferenceServicer):
             request = self._service.inputs.read(observation.message, client.session.seen)
         except RequestError as error:
             _refuse(context, error)
+        finally:
+            late.cancel()
+            client.sending.release()
         with client.changed:
             if observation.must_go or observation.timestep not in client.answered:
                 client.latest = request, observation.timestamp, observation.timestep  # an older one is out of date

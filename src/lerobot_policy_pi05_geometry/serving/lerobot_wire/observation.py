@@ -8,7 +8,7 @@ from lerobot.utils.constants import OBS_STATE
 
 from ...geometry.keys import IMAGE_PREFIX
 from ..inputs import Inputs
-from ..limits import RequestError
+from ..limits import RequestError, shown
 from .pickles import Array, Instance
 
 _MAX_NAMES = 1024
@@ -58,9 +58,8 @@ def read_robot(told: Any, inputs: Inputs, chunk_size: int) -> Robot:
     cameras = {key: name.removeprefix(IMAGE_PREFIX) for name in names_of_cameras if (key := inputs.key_of(name))}
     missing = [key for key, entry in inputs.expected.items() if entry.required and key not in (*cameras, OBS_STATE)]
     if missing:
-        raise RequestError(
-            f"The policy needs {', '.join(missing)}, but the robot has {', '.join(names_of_cameras) or 'no camera'}."
-        )
+        have = ", ".join(map(shown, names_of_cameras[:8])) or "no camera"
+        raise RequestError(f"The policy needs {', '.join(missing)}, but the robot has {have}.")
     return Robot(joints, cameras, min(actions, chunk_size))
 
 
@@ -83,12 +82,12 @@ def _number(raw: Mapping[str, Any], name: str) -> float:
     if type(value) is Array and value.value is not None and value.value.size == 1:
         return float(value.value.item())
     if type(value) not in (float, int, bool) or not abs(value) < 1e30:  # type: ignore[arg-type]
-        raise RequestError(f"The observation has no number {name[:80]}.")
+        raise RequestError(f"The observation has no number {shown(name)}.")
     return float(value)  # type: ignore[arg-type]
 
 
 def _array(raw: Mapping[str, Any], name: str) -> np.ndarray:
     value = raw[name]
     if type(value) is not Array or value.value is None:
-        raise RequestError(f"The observation's {name[:80]} is no image.")
+        raise RequestError(f"The observation's {shown(name)} is no image.")
     return value.value

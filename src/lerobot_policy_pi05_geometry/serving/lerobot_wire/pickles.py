@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from ..limits import Limits, RequestError
+from ..limits import Limits, RequestError, shown
 from .torch_storage import Storage, read_storage, rebuild_tensor
 
 MAX_OPCODES = 20_000  # an observation has some 200, instructions for a robot with 50 joints some 1,000
@@ -130,8 +130,8 @@ class _Machine:
         name, module = self.pop(), self.pop()
         full = f"{module}.{name}" if type(name) is type(module) is str else ""
         if full not in _CALLS and full not in _CLASSES and full not in _VALUES:
-            shown = full[:100] if full else "something"
-            raise PickleRefusedError(f"The message names {shown}, which is none of what a robot_client sends.")
+            what = shown(full) if full else "something"
+            raise PickleRefusedError(f"The message names {what}, which is none of what a robot_client sends.")
         self.push(_Name(full))
 
     def call(self) -> None:
@@ -139,7 +139,8 @@ class _Machine:
         if type(name) is not _Name or type(arguments) is not tuple or name.name not in _CALLS:
             raise PickleRefusedError("The message calls something that cannot be called.")
         made = _CALLS[name.name](*arguments)
-        self._room -= _bytes_of(made)  # a message may name the same bytes a thousand times
+        # A message may name the same bytes a thousand times, and each time they are read.
+        self._room -= max(_bytes_of(made), sum(len(a) for a in arguments if isinstance(a, bytes | bytearray)))
         if self._room < 0:
             raise PickleRefusedError("The message makes more of its bytes than it has.")
         self.push(made)

@@ -24,6 +24,7 @@ require_extra("serve", "websockets", "msgpack")
 
 from ..client import PolicyClient, RefusedError  # noqa: E402
 from ..keys import read_key  # noqa: E402
+from ..limits import PROTOCOL  # noqa: E402
 from .configuration_pi05_geometry_remote import NO_TRAINING, PI05GeometryRemoteConfig  # noqa: E402
 from .robot_session import RobotSession  # noqa: E402
 from .rows import requests_of  # noqa: E402
@@ -64,6 +65,11 @@ class PI05GeometryRemotePolicy(PreTrainedPolicy):
     def _complete(self) -> None:
         """Features and sizes as the server's checkpoint has them."""
         told, config = self._metadata, self.config
+        if told.get("protocol") != PROTOCOL:
+            raise ValueError(
+                f"{config.server} is a server of openpi's protocol, but not `pi05-geometry serve`: it does not say what its "
+                "policy expects."
+            )
         given = config.action_feature
         if given is not None and given.shape[0] != told["action_dim"]:
             raise ValueError(
