@@ -160,22 +160,25 @@ def against_lerobot(args: argparse.Namespace) -> dict[str, Any]:
 # --- the policy: micro-batches and flow samples -----------------------------------------------------------------------
 
 
-def build_policy(args: argparse.Namespace, **settings: Any) -> PI05GeometryPolicy:
+def policy_config(args: argparse.Namespace, **settings: Any) -> PI05GeometryConfig:
     """A policy with as many geometry tokens, of a source that needs no camera."""
     vlm, expert = VARIANTS[args.size]
     size = IMAGE_SIZE[args.size]
-    torch.manual_seed(0)
-    config = PI05GeometryConfig(
+    inputs = {
+        "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, size, size)),
+        "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
+    }
+    common: dict[str, Any] = {"dtype": "bfloat16" if args.size == "full" else "float32", "push_to_hub": False}
+    return PI05GeometryConfig(
         paligemma_variant=vlm, action_expert_variant=expert, device=args.device, image_resolution=(size, size),
-        chunk_size=CHUNK, n_action_steps=CHUNK, geometry_source="random", geometry_grid=GRID,
-        dtype="bfloat16" if args.size == "full" else "float32",
-        input_features={
-            "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, size, size)),
-            "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
-        },
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (8,))}, push_to_hub=False, **settings,
+        chunk_size=CHUNK, n_action_steps=CHUNK, geometry_source="random", geometry_grid=GRID, input_features=inputs,
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (8,))}, **common | settings,
     )  # fmt: skip
-    return PI05GeometryPolicy(config).train()
+
+
+def build_policy(args: argparse.Namespace, **settings: Any) -> PI05GeometryPolicy:
+    torch.manual_seed(0)
+    return PI05GeometryPolicy(policy_config(args, **settings)).train()
 
 
 def policy_batch(args: argparse.Namespace, size: int, seed: int) -> dict[str, Tensor]:
