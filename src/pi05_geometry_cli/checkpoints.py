@@ -16,11 +16,14 @@ def inspect(
     frame: Annotated[int, typer.Option(help="Index of the frame.")] = 0,
     device: Annotated[str, typer.Option(help="Device of the policy.")] = "cpu",
     output: Output = Path("inspect.html"),
+    rerun: Annotated[
+        Path | None, typer.Option(help="A file of the scene for the rerun viewer, too (needs rerun-sdk).")
+    ] = None,
 ) -> None:
-    """Figures of a checkpoint on a dataset frame: attention mask, depth with grid cells, attention of the actions."""
+    """Figures of a checkpoint on a dataset frame: attention mask, depth with grid cells, the scene, attention of the actions."""
     from lerobot_policy_pi05_geometry.inspect.inspection import write_inspection
 
-    write_inspection(checkpoint, dataset_root, dataset_repo_id, frame, device, output)
+    write_inspection(checkpoint, dataset_root, dataset_repo_id, frame, device, output, rerun)
     console.print(f"Open [bold]{output}[/bold]")
 
 

@@ -122,6 +122,14 @@ def aligned_errors(recording: Recording, camera: np.ndarray) -> tuple[float, flo
     return apart(best.x)
 
 
+def turned_by_convention(recording: Recording) -> np.ndarray:
+    """The camera's pose if the offsets of the first and the last joint are taken for 0, as they are in a calibration."""
+    first, last = recording.kinematics._order[1], recording.kinematics._order[-1]
+    if recording.wrist:
+        return _about(np.eye(4), last.axis, recording.offsets[-1]) @ recording.camera
+    return _about(np.array(first.origin), first.axis, -recording.offsets[0]) @ recording.camera
+
+
 def _about(frame: np.ndarray, axis: list[float], angle: float) -> np.ndarray:
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec(np.array(axis) * angle).as_matrix()

@@ -6,12 +6,17 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from ..checkpoint.load import load_policy
+from ..configuration_pi05_geometry import PI05GeometryConfig
+from ..geometry.calibration import Calibration
 from .page import Page, picture
 from .pictures import depth_figure, layout_figure, segment_share_figure
+from .scene import Scene, log_to_rerun, scene_figure, scene_of
 
 
-def write_inspection(checkpoint: str, root: Path, repo_id: str, frame: int, device: str, output: Path) -> None:
-    """Write a page about one frame of a dataset, processed by a checkpoint.
+def write_inspection(
+    checkpoint: str, root: Path, repo_id: str, frame: int, device: str, output: Path, rerun: Path | None = None
+) -> None:
+    """Write a page about one frame of a dataset, processed by a checkpoint. rerun: a file of the scene for the rerun viewer.
 
     Raises ValueError for a frame outside the dataset or a checkpoint of another policy.
     """
@@ -24,18 +29,33 @@ def write_inspection(checkpoint: str, root: Path, repo_id: str, frame: int, devi
     dataset = LeRobotDataset(repo_id, root=root, depth_output_unit=policy.config.depth_unit)
     if not 0 <= frame < len(dataset):
         raise ValueError(f"The dataset has frames 0 to {len(dataset) - 1}; there is no frame {frame}.")
-    batch = loaded.preprocess(frame_batch(dataset, frame))
+    raw = frame_batch(dataset, frame)
+    scene = scene_of_policy(policy.config, raw)
+    if rerun is not None:
+        log_to_rerun(scene, str(rerun))
+    batch = loaded.preprocess(raw)
     page = Page(f"{Path(checkpoint).name} on frame {frame} of {root.name}")
     page.lead(f"Task: {dataset[frame]['task']}")
     if policy.geometry is not None and policy.config.geometry_source == "rgbd":
         page.row(
             picture(depth_figure(policy, batch), "Depth with its grid cells, and the attention of the action tokens.")
         )
+    if scene.points:
+        page.row(
+            picture(scene_figure(scene), "Measured points in the robot's base frame, with cameras and the arm's links.")
+        )
     page.row(
         picture(layout_figure(policy, batch), "The attention mask as the network applied it."),
         picture(segment_share_figure(policy, batch), "Attention of the action tokens per segment and layer."),
     )
     page.write(output)
+
+
+def scene_of_policy(config: PI05GeometryConfig, batch: dict) -> Scene:
+    """The scene of a raw batch of one, by the calibration that a checkpoint carries."""
+    calibration = Calibration(config.calibration, config.arms, config.rigs)
+    bounds = {camera: (low, high) for camera, (low, high) in config.depth_bounds.items()}
+    return scene_of(batch, calibration, config.depth_unit, min(config.max_depth, 3.0), bounds, config.depth_keys)
 
 
 def frame_batch(dataset: LeRobotDataset, frame: int) -> dict:

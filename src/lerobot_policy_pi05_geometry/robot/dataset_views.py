@@ -11,11 +11,11 @@ from .hand_eye_problem import View
 
 STILL = np.radians(0.6)  # a joint's motion over `WINDOW` frames: more, and image and state are of different poses
 WINDOW = 2  # frames before and after
-CANDIDATES, KEPT = 120, 40
+MAX_VIEWS = 120  # the more the better: the noise of the joints leaves an error that falls with their root
 
 
 def find_views(dataset: LeRobotDataset, image_key: str, kinematics: ForwardKinematics, board: Board) -> list[View]:
-    """Up to `KEPT` views of the board, in the order of their frames.
+    """Up to `MAX_VIEWS` views of the board, in the order of their frames.
 
     Raises ValueError if there is no such image or the arm never stood still.
     """
@@ -33,12 +33,10 @@ def find_views(dataset: LeRobotDataset, image_key: str, kinematics: ForwardKinem
             "pose."
         )
     views = []
-    for frame in spread_out(values, still, CANDIDATES):
+    for frame in spread_out(values, still, MAX_VIEWS):
         seen = board.detect(to_pixels(dataset[frame][image_key]))
         if seen is not None:
             views.append(View(int(frame), values[frame], seen))
-        if len(views) == KEPT:
-            break
     return sorted(views, key=lambda view: view.frame)
 
 
