@@ -44,7 +44,7 @@ def _compiled() -> Callable[..., Any]:
     # On a GPU this analysis of PyTorch 2.11 ends in an AssertionError for the backward pass of a layer with symbolic sizes
     # (seen on an H200). It chooses tiles; without it the compiler chooses them by its older rule. Older versions have none.
     tiles = "coalesce_tiling_analysis"
-    options = {f"triton.{tiles}": False} if hasattr(config.triton, tiles) else {}
+    options: dict[str, Any] = {f"triton.{tiles}": False} if hasattr(config.triton, tiles) else {}
     return torch.compile(_call, fullgraph=True, dynamic=True, options=options)
 
 
