@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from lerobot_policy_pi05_geometry.geometry import CameraCalibration
+from lerobot_policy_pi05_geometry.geometry.calibration import Rig
+from lerobot_policy_pi05_geometry.geometry.placed_camera import PlacedCamera
 from lerobot_policy_pi05_geometry.geometry.rays import FEATURE_DIM, RaySource
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from tests.entry_points import WRIST_POSE, chunk_of, make_batch, make_calibration, make_policy, without
@@ -27,7 +29,9 @@ def test_features_are_those_of_both(encoder) -> None:
     assert source.feature_dim == plain.geometry.source.feature_dim + FEATURE_DIM
     assert torch.equal(found.features[..., :-FEATURE_DIM], seen.features)
     assert torch.equal(found.valid, seen.valid)
-    rays = RaySource(("front", "wrist"), 3, make_calibration(), {"front": (30, 40), "wrist": (28, 28)})(batch)
+    sizes = {"front": (30, 40), "wrist": (28, 28)}
+    placed = [PlacedCamera(camera, {0: Rig(make_calibration())}, size) for camera, size in sizes.items()]
+    rays = RaySource(placed, 3, sizes)(batch)
     assert torch.equal(found.features[..., -FEATURE_DIM:], rays.features)
 
 

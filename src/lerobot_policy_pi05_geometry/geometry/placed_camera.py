@@ -14,7 +14,7 @@ from .rigid import compose
 
 
 class PlacedCamera:
-    """A depth camera and where it stands. rigs: by id; data of one rig has one. size: (H, W) of its depth images.
+    """A camera and where it stands. rigs: by id; data of one rig has one. size: (H, W) of its images, of depth or of colour.
 
     `frames` differ in rig only if the data says so (`observation.calibration.rig`); `only` is the rig that a robot is.
     """

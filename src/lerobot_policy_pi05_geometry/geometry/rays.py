@@ -5,13 +5,14 @@ as in "Do You Know Where Your Camera Is?" (arXiv 2510.02268), there per pixel an
 origin and direction.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from .camera import CameraCalibration
-from .keys import batch_like, extrinsics_key
+from .keys import RAW_STATE, batch_like, extrinsics_key
+from .placed_camera import PlacedCamera
 from .point_map import as_pose
 from .rgbd import WAVELENGTHS
 from .rigid import check_rigid
@@ -23,54 +24,58 @@ FEATURE_DIM = 6 + 2 * 6 * len(WAVELENGTHS)
 class RaySource(GeometrySource):
     """Per cell: camera centre (3), unit direction (3) of the ray through the cell's centre, Fourier features of both.
 
-    Both are in the robot's base frame, the centre in metres. calibration: per camera. sizes: (H, W) of each camera's image.
+    Both are in the robot's base frame, the centre in metres. placed: the cameras in token order. sizes: (H, W) of each image.
     """
 
-    def __init__(
-        self,
-        cameras: tuple[str, ...],
-        grid: int,
-        calibration: Mapping[str, CameraCalibration],
-        sizes: Mapping[str, tuple[int, int]],
-    ) -> None:
+    def __init__(self, placed: Sequence[PlacedCamera], grid: int, sizes: Mapping[str, tuple[int, int]]) -> None:
         super().__init__()
-        self.cameras, self.grid, self.feature_dim = cameras, grid, FEATURE_DIM
-        self.calibration = {camera: calibration[camera].as_recorded() for camera in cameras}
-        directions = [camera_rays(self.calibration[camera], *sizes[camera], grid) for camera in cameras]
-        self._directions: Tensor  # (V, G, 3), in each camera's frame
-        self.register_buffer("_directions", torch.stack(directions), persistent=False)
+        self.cameras, self.grid, self.feature_dim = tuple(camera.name for camera in placed), grid, FEATURE_DIM
+        self.placed = {camera.name: camera for camera in placed}
+        directions = [
+            torch.stack([camera_rays(on_rig, *sizes[camera.name], grid) for on_rig in camera.cameras])
+            for camera in placed
+        ]
+        self._directions: Tensor  # (R, V, G, 3), in each camera's frame, for every rig
+        self.register_buffer("_directions", torch.stack(directions, dim=1), persistent=False)
 
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
-        return [
-            camera
-            for camera in self.cameras
-            if self.calibration[camera].extrinsics is None and extrinsics_key(camera) not in batch
-        ]
+        return [camera for camera in self.cameras if not self._has_pose(camera, batch)]
+
+    def _has_pose(self, camera: str, batch: Mapping[str, Tensor]) -> bool:
+        placed = self.placed[camera]
+        return extrinsics_key(camera) in batch or (placed.placed and (not placed.on_arm or RAW_STATE in batch))
 
     def missing_message(self, cameras: list[str]) -> str:
-        keys = ", ".join(extrinsics_key(camera) for camera in cameras)
+        keys = ", ".join(RAW_STATE if self.placed[camera].on_arm else extrinsics_key(camera) for camera in cameras)
         return (
             f"The observation has no pose of camera(s) {', '.join(cameras)}, which have no extrinsics in their calibration: "
-            f"expected {keys}; add extrinsics to the calibration, or the pose to every observation."
+            f"expected {keys}; add extrinsics to the calibration, or the pose to every observation (processors of new "
+            "checkpoints copy the raw state)."
         )
 
     def forward(self, batch: Mapping[str, Tensor], check: bool = True) -> GeometryFeatures:
         like = batch_like(batch)
         missing = self.missing_cameras(batch)
+        rows = self.placed[self.cameras[0]].rows(batch)  # the same for all cameras
+        if check:
+            self.placed[self.cameras[0]].check_rigs(batch)
         poses = [
             torch.full((4, 4), float("nan"), device=like.device)
             if camera in missing
-            else self._pose(camera, batch, check, like.device)
+            else self._pose(camera, batch, rows, check, like.device)
             for camera in self.cameras
         ]
         pose = torch.stack([p.expand(like.shape[0], 4, 4) for p in poses], dim=1)  # (B, V, 4, 4)
-        return ray_features(pose, self._directions.to(like.device))
+        directions = self._directions.to(like.device)
+        return ray_features(pose, directions[0] if rows is None else directions.index_select(0, rows.to(like.device)))
 
-    def _pose(self, camera: str, batch: Mapping[str, Tensor], check: bool, device: torch.device) -> Tensor:
-        """`base_T_camera`, (B, 4, 4) from the batch or (4, 4) from the calibration."""
+    def _pose(
+        self, camera: str, batch: Mapping[str, Tensor], rows: Tensor | None, check: bool, device: torch.device
+    ) -> Tensor:
+        """`base_T_camera`, (B, 4, 4) or (4, 4): from the batch, or from the calibration."""
         key = extrinsics_key(camera)
         if key not in batch:
-            return torch.tensor(self.calibration[camera].extrinsics, device=device)
+            return self.placed[camera].poses(batch, rows, device)
         pose = as_pose(batch[key], key)
         if check:
             check_rigid(pose, key)
@@ -89,7 +94,7 @@ def camera_rays(calibration: CameraCalibration, height: int, width: int, grid: i
 
 
 def ray_features(pose: Tensor, directions: Tensor) -> GeometryFeatures:
-    """Features of rays. pose: `base_T_camera` (B, V, 4, 4). directions: (V, G, 3) in the cameras' frames.
+    """Features of rays. pose: `base_T_camera` (B, V, 4, 4). directions: (V, G, 3) or (B, V, G, 3) in the cameras' frames.
 
     A camera whose pose is not finite has no valid cell.
     """

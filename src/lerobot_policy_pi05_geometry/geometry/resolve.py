@@ -152,15 +152,13 @@ def _resolve_rays(config: "PI05GeometryConfig", dataset_meta: Any | None) -> Res
             "Camera rays describe where the camera stands in the robot's base frame; leave geometry_frame=base."
         )
     recorded, rigs = _calibrated(config, dataset_meta, list(keys))
-    moving = [camera for camera in keys if any(rig.cameras[camera].mount is not None for rig in rigs.values())]
-    if len(rigs) > 1 or moving:
-        raise ValueError(
-            "geometry_source=rays knows cameras of one rig, which are fixed or give their pose with every frame; use "
-            f"geometry_source=rgbd for {'data of several rigs' if len(rigs) > 1 else 'the camera(s) ' + ', '.join(moving)}."
-        )
     changes |= recorded
-    sizes = {camera: config.image_features[key].shape[-2:] for camera, key in keys.items()}
-    return Resolved(RaySource(tuple(keys), config.geometry_grid, changes["calibration"], sizes), changes)
+    sizes = {
+        camera: (config.image_features[key].shape[-2], config.image_features[key].shape[-1])
+        for camera, key in keys.items()
+    }
+    placed = [PlacedCamera(camera, rigs, sizes[camera], config.rig) for camera in keys]
+    return Resolved(RaySource(placed, config.geometry_grid, sizes), changes)
 
 
 def _calibrated(

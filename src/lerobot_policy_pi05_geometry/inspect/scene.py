@@ -112,7 +112,8 @@ def scene_figure(scene: Scene) -> Figure:
     for axes, (title, across, up, x_name, y_name) in zip(figure.subplots(1, 2), views, strict=True):
         for (name, points), colour in zip(scene.points.items(), _COLOURS * 4, strict=False):
             some = points[:: max(1, len(points) // _SHOWN)]
-            axes.scatter(some[:, across], some[:, up], s=0.6, color=colour, alpha=0.5, label=name, linewidths=0)
+            size = float(np.clip(2000 / max(1, len(some)), 0.6, 4.0))
+            axes.scatter(some[:, across], some[:, up], s=size, color=colour, alpha=0.5, label=name, linewidths=0)
         for pose in scene.cameras.values():
             ahead = np.stack([pose[:3, 3], pose[:3, 3] + _AXIS * pose[:3, 2]])
             axes.plot(ahead[:, across], ahead[:, up], color="#868e96", linewidth=1.5)
@@ -120,7 +121,7 @@ def scene_figure(scene: Scene) -> Figure:
         for name, bones in scene.bones.items():
             for bone in bones:
                 axes.plot(bone[:, across], bone[:, up], color="#22303c", linewidth=2, marker="o", markersize=3)
-            axes.plot([], [], color="#22303c", marker="o", label=name)
+            axes.plot([], [], color="#22303c", linewidth=2, label=name)
         axes.set_aspect("equal")
         axes.set_xlabel(f"{x_name} (m, base frame)")
         axes.set_ylabel(f"{y_name} (m)")
