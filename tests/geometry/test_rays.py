@@ -130,8 +130,8 @@ def test_a_camera_on_an_arm_needs_the_raw_state_and_rigs_their_number():
         both(observation | {RAW_STATE: torch.zeros(1, 6), RIG: torch.tensor([4])})
 
 
-@pytest.mark.parametrize("tokens", ["rays", "mounted"])
-def test_a_policy_with_rays_takes_mounts_and_rigs(tokens):
+@pytest.mark.parametrize("data", ["mount", "rigs"])
+def test_a_policy_with_rays_takes_mounts_and_rigs(data):
     """Its checkpoint carries arms and rigs, as with depth, and every row follows its own rig."""
     batch = make_batch(2) | {RAW_STATE: torch.rand(2, 6)}
     cameras = make_calibration()
@@ -140,7 +140,7 @@ def test_a_policy_with_rays_takes_mounts_and_rigs(tokens):
         "front": replace(cameras["front"], extrinsics=None, mount=Mount("arm", "gripper", torch.eye(4).tolist())),
     }
     arms = {"arm": so101_like()}
-    if tokens == "mounted":
+    if data == "mount":
         policy = make_policy(geometry_source="rays", calibration=mounted, arms=arms)
     else:
         rigs = {"0": Rig(cameras), "1": Rig(mounted, arms)}
@@ -149,6 +149,6 @@ def test_a_policy_with_rays_takes_mounts_and_rigs(tokens):
     features = policy.geometry.source(batch).features[:, 0, 0, :3]
     link = ForwardKinematics(arms["arm"], ["gripper"])(batch[RAW_STATE][:1])[0, 0]
     assert (features[0] - link[:3, 3]).abs().max() < 1e-5
-    if tokens == "rays":
+    if data == "rigs":
         assert (features[1] - torch.tensor(cameras["front"].extrinsics)[:3, 3]).abs().max() < 1e-5
     policy.train().forward(batch)[0].backward()

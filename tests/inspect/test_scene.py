@@ -102,7 +102,7 @@ def test_a_policy_shows_what_its_calibration_says():
 def test_pictures_and_files_are_written(tmp_path: Path):
     batch, rig = frame()
     for scene in (scene_of(batch, rig, depth_keys=KEYS), Scene({}, {}, {"webcam": above(0.0, 0.1).numpy()})):
-        scene_figure(scene).savefig(tmp_path / "scene.png")
+        scene_figure(scene).savefig(tmp_path / "scene.png", dpi=30)
         assert (tmp_path / "scene.png").read_bytes().startswith(b"\x89PNG")
     pytest.importorskip("rerun")
     log_to_rerun(scene_of(batch, rig, depth_keys=KEYS), str(tmp_path / "scene.rrd"))
