@@ -86,6 +86,7 @@ class LeRobotServicer(services_pb2_grpc.AsyncInferenceServicer):
         if not client.sending.acquire(blocking=False):
             _refuse(context, BusyError("One call of SendObservations at a time."))
         late = threading.Timer(_SENDING, context.cancel)
+        late.daemon = True
         late.start()
         try:
             if client.robot is None:
