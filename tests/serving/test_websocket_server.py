@@ -21,6 +21,7 @@ from lerobot_policy_pi05_geometry.serving.wire import decode, encode
 from tests.entry_points import ACTION_DIM, CHUNK
 
 from .running import FakeEngine, fake_server, load, local_chunk, make_request, real_server, serving
+from .soak import silent
 from .test_wire import mutated
 
 KEY = "k" * 32
@@ -263,6 +264,16 @@ def test_half_a_frame_and_silence_end_their_own_session_only():
             assert time.monotonic() < end
         raw.close()
         good.close()
+
+
+def test_a_flood_of_pings_ends_its_own_session_only(running):
+    good, stranger = PolicyClient(running.url), silent(running.port)
+    stranger.settimeout(10)
+    ping = b"\x89\xfd\0\0\0\0" + b"x" * 125  # its answer is as long, and nobody reads it
+    with pytest.raises((ConnectionResetError, BrokenPipeError)):  # the server has hung up
+        stranger.sendall(400_000 * ping)
+    assert good.infer(mine(5))["actions"][0, 0] == 5
+    good.close()
 
 
 @pytest.mark.parametrize("seconds", [3.5, pytest.param(45.0, marks=pytest.mark.long)])

@@ -12,6 +12,7 @@
    metadata             what a client is told first
    keys                 the key that clients must know, and which addresses need one
    admission            who may connect: key, Origin, number of sessions; /healthz
+   bounded_connection   ends a client that makes the server write and does not read
    websocket_server     one session per connection
    service              a checkpoint with all of this around it
    client               the other end, for Python programs

@@ -16,6 +16,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from .admission import Admission
+from .bounded_connection import BoundedConnection
 from .engine import make_job, note_answer
 from .inputs import Inputs
 from .limits import Limits, RequestError
@@ -67,6 +68,7 @@ class WebsocketServer:
                 host,
                 port,
                 process_request=self._admission,
+                create_connection=BoundedConnection,
                 compression=None,  # a compressed frame may be a thousand times its size
                 max_size=self._limits.frame_bytes,
                 max_queue=1,
