@@ -229,6 +229,7 @@ def roll_out(checkpoint: Path, monkeypatch, *options: str, ticks: int) -> Tensor
 
     Its clock ticks five times a second, so that a slow machine delays no action by more than one tick; ticks are shorter.
     """
+    from lerobot.rollout.strategies import base
     from lerobot.scripts import lerobot_rollout
 
     DriftingArm.sent.clear()
@@ -238,7 +239,10 @@ def roll_out(checkpoint: Path, monkeypatch, *options: str, ticks: int) -> Tensor
     ]  # fmt: skip
     monkeypatch.setattr(sys, "argv", ["lerobot-rollout", *arguments])
     monkeypatch.setattr(lerobot_rollout, "init_logging", lambda: None)  # it would take the loggers from pytest
-    monkeypatch.setattr("lerobot.rollout.strategies.base.precise_sleep", lambda _: time.sleep(0.03))
+    if hasattr(base, "CycleTimer"):  # LeRobot 0.6.2
+        monkeypatch.setattr(base.CycleTimer, "wait", lambda _: time.sleep(0.03))
+    else:
+        monkeypatch.setattr(base, "precise_sleep", lambda _: time.sleep(0.03))
     lerobot_rollout.rollout()
     return torch.tensor(DriftingArm.sent)
 

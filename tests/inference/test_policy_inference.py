@@ -9,6 +9,7 @@ from lerobot.policies.common.flow_matching import euler_integrate
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 
+from lerobot_policy_pi05_geometry import compat
 from lerobot_policy_pi05_geometry.data.images import prepare_images
 from lerobot_policy_pi05_geometry.inference.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
@@ -137,6 +138,8 @@ def make_rtc_policy(enabled: bool = True, **changes) -> PI05GeometryPolicy:
         prefix_attention_schedule=RTCAttentionSchedule.LINEAR,
         max_guidance_weight=5.0,
     )
+    if compat.mode_of(config) and changes.get("rtc_mode") == "trained":
+        config.mode = "trained"  # where LeRobot's configuration has the mode, ours must not contradict it
     return make_policy(rtc_config=config, **changes)
 
 

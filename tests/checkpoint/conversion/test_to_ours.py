@@ -292,11 +292,18 @@ def test_a_truncated_file_is_named(kept, tmp_path):
         ({"chunk_size": "many"}, "chunk_size"),
         ({"use_peft": True}, "PEFT"),
         ({"type": "pi0"}, "of type 'pi0', not 'pi05'"),
-        ({"type": "pi05_geometry"}, "has unknown tensors: model.paligemma_with_expert.gemma_expert.lm_head.weight"),
     ],
 )  # fmt: skip
 def test_settings_that_do_not_fit_are_named(settings, said, tmp_path):
     assert_refused(write_lerobot(tmp_path / "source", **settings), said)
+
+
+def test_a_pi05_that_calls_itself_ours_is_refused(tmp_path):
+    """By its tensors, or by settings that LeRobot's next release adds."""
+    source = write_lerobot(tmp_path / "source", type="pi05_geometry")
+    with pytest.raises(ValueError, match=r"has unknown tensors: .*lm_head|not valid for PI05GeometryConfig"):
+        convert(source, tmp_path / "output", GeometryStart(grid=2))
+    assert not (tmp_path / "output").exists()
 
 
 def test_files_that_are_missing_are_named(tmp_path):
