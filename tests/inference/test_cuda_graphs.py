@@ -213,7 +213,7 @@ def test_geometry_is_measured_when_the_prefix_is_on_its_way(geometry: GeometrySe
 
 @pytest.mark.parametrize(
     ("make", "chunks", "dtype"),
-    [(ChunkRunner, 1000, torch.float32), (ChunkRunner, 1000, torch.bfloat16), (recording, 100, torch.float32)],
+    [(ChunkRunner, 400, torch.float32), (ChunkRunner, 200, torch.bfloat16), (recording, 100, torch.float32)],
     ids=["eager", "eager, bf16", "recorded"],
 )
 def test_many_chunks_leave_nothing_behind(make, chunks: int, dtype: torch.dtype) -> None:
