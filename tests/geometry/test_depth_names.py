@@ -21,6 +21,7 @@ from lerobot_policy_pi05_geometry.geometry.dataset_calibration import (
     read_dataset_calibration,
     write_dataset_calibration,
 )
+from lerobot_policy_pi05_geometry.geometry.keys import depth_features
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from pi05_geometry_cli import app
 from tests.entry_points import chunk_of, make_config, redraw
@@ -204,3 +205,13 @@ def test_what_streaming_does_to_the_unit_is_said(root):
             policy.geometry.train()(batch)
     else:  # LeRobot's next release
         policy.geometry.train()(batch)
+
+
+@pytest.mark.parametrize("shape", [(9, 12, 3), (3, 9, 12)])
+def test_a_depth_map_in_colours_is_a_camera_of_its_own_name(shape):
+    """Its distances are lost: it holds no depth, and a calibration belongs to the RGB camera `top_depth`."""
+    features = {
+        f"observation.images.{name}_depth": {"dtype": "image", "shape": size}
+        for name, size in (("top", shape), ("front", (9, 12, 1)))
+    }
+    assert depth_features(features, {}) == {"front": "observation.images.front_depth"}
