@@ -128,9 +128,13 @@ def test_every_frame_says_which_rig_it_is_of(two, merged):
             assert torch.equal(frame[depth_key("front")], dataset[start + number][depth_key("front")])
 
 
-def test_lerobots_merge_refuses_two_rigs_and_takes_labelled_ones(two, merged, tmp_path):
+def test_lerobots_merge_refuses_two_rigs(two, tmp_path):
     with pytest.raises(ValueError, match="Same features is expected"):
         merge_with_lerobot(two, tmp_path / "raw")
+
+
+@pytest.mark.long
+def test_lerobots_command_merges_labelled_copies_as_ours_does(two, merged, tmp_path):
     calibration = read_dataset_calibration(open_dataset(merged).meta, {})
     copies = [tmp_path / "arm0", tmp_path / "arm1"]
     for number, (root, copy) in enumerate(zip(two, copies, strict=True)):
