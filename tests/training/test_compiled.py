@@ -171,7 +171,7 @@ def test_acting_and_evaluation_stay_as_they_are():
 @pytest.mark.long
 @pytest.mark.parametrize("checkpointing", [True, False])
 def test_under_ddp(tmp_path, checkpointing):
-    """PyTorch splits compiled graphs at DDP's buckets."""
+    """A graph is not cut at DDP's buckets, where a layer that runs again for checkpointing would be another."""
     plain, compiled = pair(make_policy(gradient_checkpointing=checkpointing))
     batch = padded_batch(4)
     _, expected, _ = step(plain, batch)

@@ -49,7 +49,9 @@ def _compiled() -> Callable[..., Any]:
 
 
 def _call_compiled(layer: nn.Module, *arguments: Any) -> Any:
-    with torch._dynamo.config.patch(recompile_limit=_GRAPHS):
+    # PyTorch would cut a graph at DDP's buckets in the forward pass and not where checkpointing runs it again. A layer is small
+    # enough as it is: DDP sends its gradients while the layers before it are computed.
+    with torch._dynamo.config.patch(recompile_limit=_GRAPHS, optimize_ddp=False):
         return _compiled()(layer, *arguments)
 
 
