@@ -2,6 +2,7 @@
 
 import os
 
+import pytest
 import torch
 from hypothesis import Phase, settings
 
@@ -21,3 +22,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # MuJoCo selects its OpenGL on its first import, whichever test makes it; without a display only EGL renders.
 os.environ.setdefault("MUJOCO_GL", "egl")
 torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    """What a test draws without a generator of its own is the same in every run and order."""
+    torch.manual_seed(0)
