@@ -31,8 +31,7 @@ class RgbdSource(GeometrySource):
     as_points: instead, 16 points of the cell, which the adapter pools.
     placed: the cameras in token order. sizes: (H, W) of each camera's depth. base_frame: points in the robot's base instead of
     the camera. unit, max_depth, bounds (by camera): see `depth.to_metres`. depth_keys: see `keys.find_depth_key`.
-    optional: cameras
-    that any observation may lack. augmentation: of training batches that have `AUGMENTATION_KEY`.
+    optional: cameras that any observation may lack. augmentation: of training batches that have `AUGMENTATION_KEY`.
     Sources: Fourier features as in NeRF (Mildenhall et al., 2020), with wavelengths in metres.
     """
 
