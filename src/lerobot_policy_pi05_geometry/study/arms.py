@@ -30,6 +30,8 @@ def _geometry(title: str, reads: frozenset[str] = frozenset({DEPTH, POSE}), **ch
     return Arm(title, {f"policy.{name}": value for name, value in options.items()}, reads=reads)
 
 
+# About the faults of the condition "noise", and half of those of "calibration-2" as a standard deviation along each axis.
+_AUGMENTATION = {"noise": "0.005", "holes": "0.1", "scale": "0.02", "shift": "0.01", "turn": "1.0"}
 _NO_GEOMETRY = {"policy.geometry_source": "none"}
 
 ARMS = {
@@ -47,6 +49,10 @@ ARMS = {
     "flow-time": _geometry("segment conditioned on the current flow time", geometry_time="denoise"),
     "own-expert": _geometry("an expert of its own for geometry", geometry_expert="own"),
     "dropout": _geometry("geometry masked in half of the training samples", geometry_dropout="0.5"),
+    "augmented": _geometry(
+        "geometry with noise, holes and errors of scale and pose added to depth in training",
+        **{f"depth_augmentation.{name}": size for name, size in _AUGMENTATION.items()},
+    ),
     "parallel": _geometry("parallel positions", geometry_positions="parallel"),
     "camera-frame": _geometry("points in the camera's frame", frozenset({DEPTH}), geometry_frame="camera"),
     "grid-4": _geometry("4 x 4 cells", geometry_grid="4"),
