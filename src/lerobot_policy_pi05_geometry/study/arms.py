@@ -25,7 +25,10 @@ class Arm:
     adapts: str | None = None
 
 
-def _geometry(title: str, reads: frozenset[str] = frozenset({DEPTH, POSE}), **changes: str) -> Arm:
+_DEPTH_AND_POSE = frozenset({DEPTH, POSE})
+
+
+def _geometry(title: str, reads: frozenset[str] = _DEPTH_AND_POSE, **changes: str) -> Arm:
     options = {"geometry_source": "rgbd", **changes}
     return Arm(title, {f"policy.{name}": value for name, value in options.items()}, reads=reads)
 
@@ -51,6 +54,7 @@ ARMS = {
     "dropout": _geometry("geometry masked in half of the training samples", geometry_dropout="0.5"),
     "augmented": _geometry(
         "geometry with noise, holes and errors of scale and pose added to depth in training",
+        _DEPTH_AND_POSE,
         **{f"depth_augmentation.{name}": size for name, size in _AUGMENTATION.items()},
     ),
     "parallel": _geometry("parallel positions", geometry_positions="parallel"),
