@@ -156,7 +156,7 @@ def test_a_checkpoint_is_evaluated_and_inspected(study, tmp_path):
     page = tmp_path / "page.html"
     dataset = f"--dataset.root={run.data_folder}"
     command("inspect", str(run.checkpoint), dataset, "--frame", "3", "--output", str(page))
-    assert page.read_text().count("<img ") == 3
+    assert page.read_text().count("<img ") == 4  # with the scene
     assert "there is no frame 99999" in command("inspect", str(run.checkpoint), dataset, "--frame", "99999", code=1)
 
 
