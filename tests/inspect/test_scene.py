@@ -13,9 +13,10 @@ from lerobot_policy_pi05_geometry.geometry.keys import RIG, depth_key, extrinsic
 from lerobot_policy_pi05_geometry.geometry.kinematics import ForwardKinematics
 from lerobot_policy_pi05_geometry.inspect.inspection import scene_of_policy
 from lerobot_policy_pi05_geometry.inspect.scene import Scene, log_to_rerun, scene_figure, scene_of
-from tests.entry_points import make_observation, make_policy
+from tests.entry_points import make_config, make_observation, make_policy
 from tests.geometry.arms import so101_like
 from tests.geometry.scenes import calibrated, depth_of_plane, looking_at
+from tests.serving.running import POSE, make_rigs
 
 SIZE = (12, 16)
 FLOOR = -0.3
@@ -97,6 +98,16 @@ def test_a_policy_shows_what_its_calibration_says():
         if camera == "front":
             expected = (measured.features[0, view, :, :3] * weights[:, None]).sum(dim=0) / weights.sum()
             np.testing.assert_allclose(scene.points[camera].mean(axis=0), expected.numpy(), atol=1e-4)
+
+
+def test_a_policy_of_one_of_several_rigs_shows_that_ones():
+    raw, rigs = make_observation(1), make_rigs(POSE)
+    config = make_config(calibration={}, rigs=rigs, rig=5)
+    alone = make_config(calibration=rigs["5"].cameras)
+    found, expected = (scene_of_policy(c, raw) for c in (config, alone))
+    assert found.points.keys() == expected.points.keys() != set()
+    for camera, points in expected.points.items():
+        np.testing.assert_array_equal(found.points[camera], points)
 
 
 def test_pictures_and_files_are_written(tmp_path: Path):

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
-from lerobot_policy_pi05_geometry.planner.options import da3_variant
+from lerobot_policy_pi05_geometry.planner.options import configuration, da3_variant, policy_options, typed
 from pi05_geometry_cli import app
 from pi05_geometry_cli.app import console
 
@@ -20,6 +20,13 @@ SHORT = ["--policy.gradient_checkpointing=true", "--policy.geometry_source=none"
 def wide(monkeypatch):
     """Tables that break no words, whatever the width was when the console was made."""
     monkeypatch.setattr(console, "width", 200)
+
+
+def test_a_part_of_a_setting_is_a_setting():
+    options = policy_options([*TINY, "--policy.depth_augmentation.noise=0.01", "--policy.geometry_source=rgbd"])
+    config = configuration(options)
+    assert config.depth_augmentation.noise == 0.01
+    assert typed(options, config)["depth_augmentation"] == config.depth_augmentation
 
 
 def plan(*arguments: str) -> str:

@@ -38,6 +38,14 @@ def url():
         yield running.url
 
 
+@pytest.mark.parametrize("source", ["rgbd", "rays", "none"])
+def test_every_source_with_poses_has_rigs(source) -> None:
+    config = make_config(calibration={}, rigs=make_rigs(None), geometry_source=source)
+    rigs = Rigs(config)
+    assert rigs.ids == ([] if source == "none" else [2, 5])
+    assert Rigs(config, only=5 if rigs.ids else None).default == (5 if rigs.ids else None)
+
+
 def local(loaded, rigs: list[int | None], requests: list[dict], noise: torch.Tensor) -> np.ndarray:
     loaded.policy.reset()
     batch = observation_of(*requests)

@@ -85,6 +85,14 @@ def test_what_cannot_be_studied_is_named(root, tmp_path):
         runs(held_out=1.0)
 
 
+def test_only_arms_that_measure_depth_get_its_augmentation(root, tmp_path):
+    options = {f"policy.depth_augmentation.{name}": "0.01" for name in ("noise", "shift")}
+    kept = {"geometry": {"noise", "shift"}, "camera-frame": {"noise"}, "rgb": set(), "random": set(), "blind": set()}
+    for run in held_out_runs(tmp_path, root, "local/mine", list(kept), [0], options, 4, 0.2, 3):
+        given = [a for a in run.arguments(tmp_path / "run") if "depth_augmentation" in a]
+        assert {a.partition("=")[0].rpartition(".")[2] for a in given} == kept[run.arm_name]
+
+
 @pytest.mark.train
 def test_a_study_of_a_dataset_end_to_end(root, tmp_path):
     arguments = [

@@ -54,6 +54,9 @@ def write_inspection(
 def scene_of_policy(config: PI05GeometryConfig, batch: dict) -> Scene:
     """The scene of a raw batch of one, by the calibration that a checkpoint carries."""
     calibration = Calibration(config.calibration, config.arms, config.rigs)
+    if config.rigs and config.rig is not None:  # the policy acts on this robot only
+        rig = config.rigs[str(config.rig)]
+        calibration = Calibration(rig.cameras, rig.arms)
     bounds = {camera: (low, high) for camera, (low, high) in config.depth_bounds.items()}
     return scene_of(batch, calibration, config.depth_unit, min(config.max_depth, 3.0), bounds, config.depth_keys)
 

@@ -62,7 +62,7 @@ def draw_flow(
         dropout.append(generator.random())
         camera.append(generator.random())
         key.append(generator.integers(0, 1 << 62))
-        delay.append(generator.integers(0, max_delay, endpoint=True))
+        delay.append(generator.integers(0, max_delay, endpoint=True))  # last: with 0 nothing is drawn
     noises, times = torch.from_numpy(np.stack(noise)), torch.from_numpy(np.stack(time)).float()
     if samples == 1:
         noises, times = noises[:, 0], times[:, 0]

@@ -46,7 +46,7 @@ def policy_options(arguments: Sequence[str]) -> dict[str, str]:
             raise ValueError(
                 f"'{argument}' is not an option of this command; the policy's settings are {_PREFIX}name=value; see --help."
             )
-        if name not in known:
+        if name.partition(".")[0] not in known:
             raise ValueError(
                 f"{_PREFIX}{name} is not a setting of this policy; see `PI05GeometryConfig` for all settings."
             )
@@ -78,7 +78,8 @@ def configuration(options: Mapping[str, str]) -> PI05GeometryConfig:
 
 def typed(options: Mapping[str, str], config: PI05GeometryConfig) -> dict[str, Any]:
     """The values that the options' settings have in the configuration."""
-    return {name: getattr(config, name) for name in options if name not in ("path", "type", "device")}
+    settings = {name.partition(".")[0] for name in options}  # `depth_augmentation.noise` is a part of one
+    return {name: getattr(config, name) for name in settings - {"path", "type", "device"}}
 
 
 def da3_variant(encoder: str) -> Da3Variant:

@@ -19,6 +19,7 @@ from ..geometry.keys import RAW_STATE, find_depth_key, find_depth_keys
 from ..geometry.kinematics import Arm, ForwardKinematics
 from ..geometry.placed_camera import PlacedCamera
 from .dataset_views import spread_out, still_frames
+from .link_files import body_name
 
 MAX_SCALE_ERROR = 0.10
 MIN_PIXELS = 100  # with a link in them, over all frames
@@ -51,7 +52,7 @@ class ArmShape:
         self.arm = arm
         moved = [link.name for link in arm.links if len(arm.chain(link.name)) > 1]
         self.kinematics = ForwardKinematics(arm, moved)
-        bodies = {self.model.body(i).name: i for i in range(self.model.nbody)}
+        bodies = {body_name(self.model, i): i for i in range(self.model.nbody)}
         # A link whose place the state does not tell is none to measure.
         placed = [name for name in moved if not ForwardKinematics(arm, [name]).unknown_joints]
         self._bodies = [bodies[name] for name in placed if name in bodies and bodies[name] > 0]

@@ -107,7 +107,7 @@ def _read_mjcf(path: Path) -> list[Link]:
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE): "revolute", int(mujoco.mjtJoint.mjJNT_SLIDE): "prismatic"}
     links = [Link(model.body(0).name)]
     for body in range(1, model.nbody):
-        name, parent = model.body(body).name or f"body{body}", _body_name(model, int(model.body_parentid[body]))
+        name, parent = body_name(model, body), body_name(model, int(model.body_parentid[body]))
         pose: np.ndarray = np.eye(4)
         pose[:3, 3] = model.body_pos[body]
         pose[:3, :3] = Rotation.from_quat(model.body_quat[body], scalar_first=True).as_matrix()
@@ -127,7 +127,8 @@ def _read_mjcf(path: Path) -> list[Link]:
     return links
 
 
-def _body_name(model, body: int) -> str:
+def body_name(model, body: int) -> str:
+    """The name of a body of MuJoCo, or its number where the file gives none."""
     return str(model.body(body).name or f"body{body}")
 
 

@@ -26,6 +26,7 @@ from ..geometry.keys import CALIBRATION_PREFIX, DEPTH_SUFFIX, IMAGE_PREFIX, dept
 from .limits import Limits, RequestError, shown
 from .rigs import Rigs
 
+_EXTRINSICS = ".extrinsics"
 _FLOATS = ("<f4", "<f8")
 _IMAGE = (0, 0, 3)  # any height and width
 _NESTED = ("images", "depth", "extrinsics")
@@ -225,13 +226,22 @@ def _expected(config: PI05GeometryConfig) -> Iterable[Input]:
     if config.geometry_source == "rgbd":
         for camera, size in config.depth_cameras().items():
             yield Input(depth_key(camera), size, ("<u2", "<f4"), config.depth_unit, True)
-            rigs = [rig.cameras for rig in config.rigs.values()] or [config.calibration]
-            placed = all(_is_placed(cameras.get(camera)) for cameras in rigs)
-            posed = config.geometry_frame == "camera" or placed
-            yield Input(extrinsics_key(camera), (4, 4), _FLOATS, "base_T_camera in metres, OpenCV axes", not posed)
+            yield _pose(config, camera, config.geometry_frame == "base")
+    else:  # rays need a pose, too
+        for key in config.geometry_features:
+            if key.startswith(CALIBRATION_PREFIX) and key.endswith(_EXTRINSICS):
+                yield _pose(config, key.removeprefix(CALIBRATION_PREFIX).removesuffix(_EXTRINSICS), True)
     state = config.robot_state_feature
     assert state is not None  # validate_features adds it
     yield Input(OBS_STATE, tuple(state.shape), _FLOATS, "as recorded, not normalised", True)
+
+
+def _pose(config: PI05GeometryConfig, camera: str, needed: bool) -> Input:
+    """A camera's pose, which a request must have if it is needed and the calibration does not place the camera."""
+    rigs = [rig.cameras for rig in config.rigs.values()] or [config.calibration]
+    placed = all(_is_placed(cameras.get(camera)) for cameras in rigs)
+    unit = "base_T_camera in metres, OpenCV axes"
+    return Input(extrinsics_key(camera), (4, 4), _FLOATS, unit, needed and not placed)
 
 
 def _is_placed(camera: CameraCalibration | None) -> bool:

@@ -19,7 +19,7 @@ class Rigs:
 
     def __init__(self, config: PI05GeometryConfig, only: int | None = None) -> None:
         """only: the rig that is served, whoever asks. Raises ValueError for one that the checkpoint does not have."""
-        known = sorted(map(int, config.rigs)) if config.geometry_source == "rgbd" else []
+        known = [] if config.geometry_source in ("none", "random") else sorted(map(int, config.rigs))
         if config.rig is not None and known:
             known = [config.rig]
         if only is not None and only not in known:

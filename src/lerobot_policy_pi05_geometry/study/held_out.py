@@ -88,7 +88,7 @@ class HeldOutRun(Run):
                 "policy.type": "pi05_geometry",
                 "policy.push_to_hub": "false",
                 "num_workers": 0,
-                **dict(self.options),
+                **self._users_options(),
                 **self.arm.options,
                 **self._blind_inputs(),
                 "dataset.repo_id": self.repo_id,
@@ -101,6 +101,16 @@ class HeldOutRun(Run):
                 "output_dir": output,
             }
         )
+
+    def _users_options(self) -> dict[str, str]:
+        """The user's options, without augmentation of depth for arms that measure none, or none in the base frame."""
+        options, source = dict(self.options), self.arm.options.get("policy.geometry_source", "rgbd")
+        if source != "rgbd":
+            unused: tuple[str, ...] = ("",)
+        else:
+            unused = ("shift", "turn") if self.arm.options.get("policy.geometry_frame") == "camera" else ()
+        prefixes = tuple(f"policy.depth_augmentation.{name}" for name in unused)
+        return {name: value for name, value in options.items() if not (prefixes and name.startswith(prefixes))}
 
     def _blind_inputs(self) -> dict[str, str]:
         """Inputs of the blind arm, with this dataset's state size."""

@@ -187,6 +187,19 @@ def test_another_frame_is_another_meaning(rgbd, tmp_path) -> None:
     assert config["geometry_frame"] == "camera"
 
 
+@pytest.mark.parametrize(
+    ("start", "left"),
+    [({"frame": "camera"}, (0.01, 0.0)), ({"source": "none"}, (0.0, 0.0)), ({"grid": 2}, (0.01, 0.02))],
+)
+def test_augmentation_of_depth_is_kept_where_there_is_such_depth(rgbd, tmp_path, start, left) -> None:
+    policy = shutil.copytree(rgbd, tmp_path / "policy")
+    config = json.loads((policy / "config.json").read_text())
+    config["depth_augmentation"] |= {"noise": 0.01, "shift": 0.02}
+    (policy / "config.json").write_text(json.dumps(config))
+    _, _, after = change(policy, tmp_path / "output", **start)
+    assert (after["depth_augmentation"]["noise"], after["depth_augmentation"]["shift"]) == left
+
+
 def test_points_instead_of_statistics(rgbd, tmp_path) -> None:
     before, after, config = change(rgbd, tmp_path / "output", tokens="points")
     pooling = {f"geometry.adapter.point_{side}.{name}" for side in ("in", "out") for name in ("weight", "bias")}

@@ -17,7 +17,7 @@ A checkpoint of an earlier version, whose gate was a logarithm, is brought up to
 import math
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from torch import Tensor
 from ...configuration_pi05_geometry import DEFAULT_ENCODER, PI05GeometryConfig
 from ...geometry.adapter import PointAdapter
 from ...geometry.da3.weights import meta_da3
+from ...geometry.depth_augmentation import DepthAugmentation
 from ...geometry.resolve import FROM_RGB, camera_names
 from ...weight_files.strict_load import complain
 from .geometry_start import SHUT, TAKE_UP, GeometryStart
@@ -103,6 +104,10 @@ def _plan(before: PI05GeometryConfig, start: GeometryStart, features_from_data: 
     after.geometry_expert = start.expert or before.geometry_expert
     same_kind = (after.geometry_source in _DA3) == (before.geometry_source in _DA3)
     after.geometry_tokens = start.tokens or (before.geometry_tokens if same_kind else "statistics")
+    if after.geometry_source != "rgbd":  # augmentation of what is not measured any more would be refused
+        after.depth_augmentation = DepthAugmentation()
+    elif after.geometry_frame != "base":
+        after.depth_augmentation = replace(after.depth_augmentation, shift=0.0, turn=0.0)
     start.calibrate(after)
     if features_from_data:
         after.input_features, after.output_features, after.optional_cameras = {}, {}, {}
