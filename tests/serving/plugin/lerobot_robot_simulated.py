@@ -78,5 +78,9 @@ class SimulatedRobot(Robot):
             self._file.flush()
         self._steps += 1
         if self._steps == self.config.actions:
+            if (
+                signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+            ):  # as a shell has it for what it starts in the background
+                signal.signal(signal.SIGINT, signal.default_int_handler)
             os.kill(os.getpid(), signal.SIGINT)
         return action
