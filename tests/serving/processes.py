@@ -106,6 +106,8 @@ def run_here(module: str, *options: str, folder: Path, timeout: float = 120) -> 
             patch.syspath_prepend(path)
         patch.chdir(folder)  # they write logs there
         patch.setattr(sys, "argv", [module, *options, f"--robot.calibration_dir={folder}"])
+        # Whatever a shell or a program that ran here before has made of it: the simulated robot ends programs by it.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
             with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
                 runpy.run_module(module, run_name="__main__", alter_sys=True)
