@@ -227,7 +227,7 @@ def _expected(config: PI05GeometryConfig) -> Iterable[Input]:
         for camera, size in config.depth_cameras().items():
             yield Input(depth_key(camera), size, ("<u2", "<f4"), config.depth_unit, True)
             yield _pose(config, camera, config.geometry_frame == "base")
-    else:  # rays need a pose, too
+    elif config.geometry_source not in ("none", "random"):  # rays need a pose, too
         for key in config.geometry_features:
             if key.startswith(CALIBRATION_PREFIX) and key.endswith(_EXTRINSICS):
                 yield _pose(config, key.removeprefix(CALIBRATION_PREFIX).removesuffix(_EXTRINSICS), True)
