@@ -44,7 +44,7 @@ def test_geometry_reaches_neither_the_prompt_nor_siglip_nor_the_normaliser():
     policy = redraw(PI05GeometryPolicy(config)).eval()
     seen = []
     tower = policy.model.paligemma_with_expert.paligemma.model.vision_tower
-    tower.register_forward_hook(
+    tower.vision_model.embeddings.register_forward_hook(
         lambda _m, args, kwargs, _o: seen.append(args[0] if args else kwargs["pixel_values"]), with_kwargs=True
     )
     raw = make_observation()
