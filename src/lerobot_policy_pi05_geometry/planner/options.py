@@ -78,8 +78,8 @@ def configuration(options: Mapping[str, str]) -> PI05GeometryConfig:
 
 def typed(options: Mapping[str, str], config: PI05GeometryConfig) -> dict[str, Any]:
     """The values that the options' settings have in the configuration."""
-    settings = {name.partition(".")[0] for name in options}  # `depth_augmentation.noise` is a part of one
-    return {name: getattr(config, name) for name in settings - {"path", "type", "device"}}
+    settings = dict.fromkeys(name.partition(".")[0] for name in options)  # `depth_augmentation.noise` is a part of one
+    return {name: getattr(config, name) for name in settings if name not in ("path", "type", "device")}
 
 
 def da3_variant(encoder: str) -> Da3Variant:
