@@ -385,7 +385,7 @@ def test_an_environment_whose_renderer_does_not_start_can_be_closed(monkeypatch)
     def no_context(*_):
         raise RuntimeError("no rendering context")
 
-    monkeypatch.setattr(mujoco, "Renderer", no_context)
+    monkeypatch.setattr(mujoco, "MjrContext", no_context)
     environment = RgbdMetaworldEnv(TASK)
     with pytest.raises(RuntimeError, match="no rendering context"):
         environment.reset(seed=0)

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 
 from .cameras import extrinsics, find_range, intrinsics
-from .headless import mujoco
+from .renderer import RgbdRenderer
 from .sensor import SENSORS
 from .tasks import find_task, make_simulator
 
@@ -18,12 +18,6 @@ FPS = 20
 MAX_DEPTH_MM = 10_000  # larger depth counts as not measured: stored as 0
 STATE_NAMES = ["hand.x", "hand.y", "hand.z", "gripper"]
 ACTION_NAMES = ["hand.dx", "hand.dy", "hand.dz", "gripper"]
-_SLOW_RENDERING = (
-    mujoco.mjtRndFlag.mjRND_SHADOW,
-    mujoco.mjtRndFlag.mjRND_REFLECTION,
-    mujoco.mjtRndFlag.mjRND_SKYBOX,
-    mujoco.mjtRndFlag.mjRND_HAZE,
-)
 
 
 class RgbdMetaworldEnv(gym.Env):
@@ -66,8 +60,7 @@ class RgbdMetaworldEnv(gym.Env):
 
     def _start(self) -> None:
         simulator = make_simulator(self._spec)
-        simulator.model.vis.quality.offsamples = 0  # without multisampling, software rendering is ten times as fast
-        self._renderer = mujoco.Renderer(simulator.model, self.image_size, self.image_size)
+        self._renderer = RgbdRenderer(simulator.model, self.image_size)
         self.calibration = {CAMERA: intrinsics(simulator.model, self.image_size)}
         self._simulator = simulator  # last, so that close() does nothing if the renderer did not start
 
@@ -100,7 +93,7 @@ class RgbdMetaworldEnv(gym.Env):
         return self._observe(), reward, success, truncated, {"is_success": success}
 
     def _observe(self) -> dict:
-        self._pixels, depth = self._render()
+        self._pixels, depth = self._renderer.render(self._simulator.data, self._camera)
         millimetres = np.rint(self._sensor.measure(depth, self._sensor_random) * 1000.0)
         millimetres[millimetres > MAX_DEPTH_MM] = 0
         return {
@@ -109,18 +102,6 @@ class RgbdMetaworldEnv(gym.Env):
             DEPTH_KEY: millimetres.astype(np.float32)[..., None],
             EXTRINSICS_KEY: (extrinsics(self._renderer.scene) @ self._pose_error).astype(np.float32),
         }
-
-    def _render(self) -> tuple[np.ndarray, np.ndarray]:
-        """RGB (S, S, 3) uint8 and depth (S, S) in metres along the optical axis."""
-        renderer, data = self._renderer, self._simulator.data
-        renderer.update_scene(data, self._camera)
-        for flag in _SLOW_RENDERING:
-            renderer.scene.flags[flag] = 0
-        pixels = renderer.render()
-        renderer.enable_depth_rendering()
-        depth = renderer.render()
-        renderer.disable_depth_rendering()
-        return pixels, depth
 
     def render(self) -> np.ndarray:
         """The last RGB image, enlarged four times for videos."""
