@@ -38,7 +38,7 @@ def bench(
     dataset_repo_id: Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")] = "local/dataset",
     rounds: Annotated[int, typer.Option(help="Predictions to time.")] = 20,
 ) -> None:
-    """Latency of an action chunk of a checkpoint on this machine, of its parts, and advice."""
+    """Latency of an action chunk of a checkpoint on this machine, of its parts and by denoising steps, and advice."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from rich.table import Table
 
@@ -58,6 +58,7 @@ def bench(
     rows = {"action chunk": result.chunk, "plain path": result.plain} | {
         f"  {name}": timing for name, timing in result.parts.items()
     }
+    rows |= {f"{count} denoising step{'s' * (count > 1)}": timing for count, timing in result.steps.items()}
     for name, timing in rows.items():
         table.add_row(name, f"{timing.p50:.1f}", f"{timing.p95:.1f}")
     console.print(table)

@@ -195,8 +195,9 @@ def test_real_time_chunking_is_served_by_the_runner(changes, caplog):
     assert not caplog.records
 
 
-def test_trained_real_time_chunking_keeps_what_is_executed():
-    policy = make_rtc_policy(rtc_mode="trained", rtc_training_max_delay=3)
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_trained_real_time_chunking_keeps_what_is_executed(steps):
+    policy = make_rtc_policy(rtc_mode="trained", rtc_training_max_delay=3, num_inference_steps=steps)
     batch, noise, left = make_batch(1), torch.randn(1, CHUNK, 8), torch.randn(1, 5, ACTION_DIM)
     with_prefix, without_prefix = (
         policy.predict_action_chunk(batch, noise=noise, prev_chunk_left_over=left, inference_delay=delay)
@@ -204,7 +205,7 @@ def test_trained_real_time_chunking_keeps_what_is_executed():
     )
     assert torch.equal(with_prefix[:, :2], left[:, :2])
     assert ((with_prefix - without_prefix)[:, 2:].abs().amax(dim=(0, 2)) > 1e-4).all()  # all others follow it
-    unguided = make_policy().predict_action_chunk(batch, noise=noise)
+    unguided = make_policy(num_inference_steps=steps).predict_action_chunk(batch, noise=noise)
     torch.testing.assert_close(without_prefix, unguided, atol=1e-5, rtol=1e-5)
 
 

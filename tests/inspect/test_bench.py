@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lerobot_policy_pi05_geometry.checkpoint.load import LoadedPolicy
-from lerobot_policy_pi05_geometry.inspect.bench import PARTS, bench, random_observation
+from lerobot_policy_pi05_geometry.inspect.bench import PARTS, STEPS, bench, random_observation
 from tests.entry_points import CHUNK, make_observation, make_policy, make_processors
 
 
@@ -28,6 +28,8 @@ def test_every_part_is_timed_and_the_parts_are_the_whole():
     assert all(0 < part.p50 <= part.p95 for part in result.parts.values())
     assert 0 < result.chunk.p50 <= result.chunk.p95
     assert result.plain.p50 > 0
+    assert list(result.steps) == list(STEPS)
+    assert result.steps[3] == result.chunk  # its own number is not timed again
     assert result.explanation["runner"] == "active"
 
 
@@ -43,7 +45,7 @@ def test_parts_give_the_policys_own_actions(changes):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(torch, "randn", lambda *_, **__: noise.clone())
         bench(observed, make_observation(1), rounds=1)
-    assert len(seen) == 4 * 3  # whole, plain, parts and fewer steps, each with two rounds of warming up
+    assert len(seen) == (3 + len(STEPS) - 1) * 3  # whole, plain, parts, other steps; two rounds warm up
     for actions in seen[:9]:
         assert torch.allclose(actions, expected, atol=1e-5)
 

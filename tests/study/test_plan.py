@@ -1,10 +1,13 @@
 """Phases of a study, its stop rule, its report and its estimate, on outcomes that are made up: nothing is trained."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 
+from lerobot_policy_pi05_geometry import PI05GeometryConfig
+from lerobot_policy_pi05_geometry.study import adapted, simulated
 from lerobot_policy_pi05_geometry.study.adapted import AdaptedRun
 from lerobot_policy_pi05_geometry.study.estimate import Costs, estimate
 from lerobot_policy_pi05_geometry.study.growth_report import write_growth_report
@@ -151,3 +154,17 @@ def test_the_study_that_comes_along_is_the_one_that_was_promised(tmp_path):
     assert {(run.task, run.arm_name) for run in runs} == {(task, arm) for task in tasks for arm in arms}
     geometry = next(run for run in runs if run.arm_name == "geometry")
     assert {"inside", "outside", "depth-off", "noise", "calibration-1"} <= set(geometry.conditions)
+
+
+@pytest.mark.parametrize("arm", ["geometry", "rgb+modulation"])
+def test_a_condition_of_denoising_steps_reaches_the_policy(arm, tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr(adapted, "adapt", lambda *_: None)
+    monkeypatch.setattr(adapted, "LeRobotDataset", lambda *_, **__: None)
+    loaded = SimpleNamespace(policy=SimpleNamespace(config=PI05GeometryConfig(device="cpu")))
+    monkeypatch.setattr(simulated, "load_policy", lambda *_, **options: given.append(options) or loaded)
+    run = next(run for run in runs_of(SPEC, tmp_path) if run.arm_name == arm)
+    for condition in ("inside", "steps-1", "steps-10"):
+        run.load(condition, None)
+    assert given == [{}, {"num_inference_steps": 1}, {"num_inference_steps": 10}]
+    assert len({run.outcome(condition) for condition in ("inside", "steps-1", "steps-10")}) == 3

@@ -56,7 +56,8 @@ def test_the_default_study_is_the_one_that_was_promised(tmp_path):
     assert spec.budget.evaluation_episodes >= 50
     conditions = {(run.task, run.arm_name): set(run.conditions) for run in runs_of(spec, tmp_path)}
     arms = {task: {arm for t, arm in conditions if t == task} for task, _ in conditions}
-    assert max(arms.values(), key=len) == set(ARMS) - {"rgb+rays", "rgb+modulation", "augmented"}  # of other studies
+    of_other_studies = {"rgb+rays", "rgb+modulation", "augmented", "noise-times", "uniform-times"}
+    assert max(arms.values(), key=len) == set(ARMS) - of_other_studies
     assert len(arms) >= 3
     for task, on_task in arms.items():
         assert {"blind", "rgb", "rgb-wide", "geometry"} <= on_task
@@ -134,6 +135,14 @@ def test_an_azimuth_is_a_condition():
     for wrong in ("azimuth", "azimuth+north", "azimuthnan", "azimuth+inf"):
         with pytest.raises(ValueError, match="no camera range"):
             find_range(wrong)
+
+
+def test_a_number_of_denoising_steps_is_a_condition():
+    assert find_condition("steps-3").denoising_steps == 3
+    assert find_condition("inside").denoising_steps is None
+    for wrong in ("steps-0", "steps-", "steps--1", "steps-2.5", "steps-²"):
+        with pytest.raises(ValueError, match="no condition 'steps-"):
+            find_condition(wrong)
 
 
 GROWING = (

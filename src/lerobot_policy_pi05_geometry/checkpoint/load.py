@@ -23,16 +23,21 @@ class LoadedPolicy:
     postprocess: Callable[[torch.Tensor], torch.Tensor]
 
 
-def load_policy(checkpoint: str | Path, device: str = "cpu", environment: Any | None = None) -> LoadedPolicy:
+def load_policy(
+    checkpoint: str | Path, device: str = "cpu", environment: Any | None = None, num_inference_steps: int | None = None
+) -> LoadedPolicy:
     """Load a checkpoint folder or hub id. LoRA is merged into the weights.
 
-    environment: a LeRobot `EnvConfig` whose features the policy has to fit, or None.
+    environment: a LeRobot `EnvConfig` whose features the policy has to fit, or None. num_inference_steps: denoising steps of a
+    chunk, instead of the checkpoint's.
     Raises FileNotFoundError or ValueError if it is not a checkpoint of this policy.
     """
     require_policy_type(checkpoint, PI05GeometryPolicy.name)
     config = PreTrainedConfig.from_pretrained(checkpoint)
     config.pretrained_path = Path(checkpoint)
     config.device = device
+    if num_inference_steps is not None:
+        config.num_inference_steps = num_inference_steps  # type: ignore[attr-defined]
     if config.use_peft:
         policy = _fold_lora(checkpoint, config)
     elif environment is None:

@@ -19,6 +19,7 @@ from ..inference.runner import ChunkRunner, ChunkSettings, Observation
 from ..model.segments import GeometryTokens
 
 PARTS = ("prompt and state", "geometry features", "vision and text", "prefix", "geometry", "denoising", "actions out")
+STEPS = (1, 2, 3, 5, 10)  # numbers of denoising steps that are timed beside the checkpoint's own
 _LARGE = 0.3  # a part with at least this share of the time gets advice
 
 
@@ -32,11 +33,15 @@ class Timing:
 
 @dataclass(frozen=True)
 class BenchResult:
-    """Timings of a prediction with the configured runner and with the plain path, of its parts, and advice."""
+    """Timings of a prediction with the configured runner and with the plain path, of its parts, and advice.
+
+    steps: the prediction with other numbers of denoising steps, fewest first.
+    """
 
     chunk: Timing
     plain: Timing
     parts: dict[str, Timing]
+    steps: dict[int, Timing]
     explanation: dict[str, str]
     peak_bytes: int | None
     advice: list[str]
@@ -83,11 +88,11 @@ def bench(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int = 20) -
     plain = _time(lambda: predict(runner="plain"), rounds, device)
     explanation = policy.sampler.explain(policy.config.inference_runner)  # type: ignore[arg-type]
     parts = _parts(loaded, observation, rounds, device) if explanation["runner"] == "active" else {}
-    fewer = max(1, policy.config.num_inference_steps // 2)
-    halved = _time(lambda: predict(num_steps=fewer), rounds, device)
-    return BenchResult(
-        chunk, plain, parts, explanation, peak, _advice(policy.config, chunk, halved, fewer, parts, explanation)
-    )
+    own = policy.config.num_inference_steps
+    steps = {n: _time(partial(predict, num_steps=n), rounds, device) for n in STEPS if n != own}
+    steps = dict(sorted((steps | {own: chunk}).items()))
+    advice = _advice(policy.config, steps, parts, explanation)
+    return BenchResult(chunk, plain, parts, steps, explanation, peak, advice)
 
 
 def _parts(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int, device: str) -> dict[str, Timing]:
@@ -130,12 +135,7 @@ def _parts(loaded: LoadedPolicy, observation: dict[str, Any], rounds: int, devic
 
 
 def _advice(
-    config: PI05GeometryConfig,
-    chunk: Timing,
-    halved: Timing,
-    fewer: int,
-    parts: dict[str, Timing],
-    explanation: dict[str, str],
+    config: PI05GeometryConfig, steps: dict[int, Timing], parts: dict[str, Timing], explanation: dict[str, str]
 ) -> list[str]:
     """Advice that follows from the measurement, for the largest part first."""
     advice = []
@@ -145,10 +145,13 @@ def _advice(
     large = {name: part.p50 / whole for name, part in parts.items() if part.p50 > _LARGE * whole}
     cameras = len(config.image_features)
     for name, share in sorted(large.items(), key=lambda item: -item[1]):
-        if name == "denoising" and fewer < config.num_inference_steps:
+        own = config.num_inference_steps
+        fewer = [count for count in steps if count <= own // 2]
+        if name == "denoising" and fewer:
             advice.append(
-                f"Denoising takes {share:.0%}: with {fewer} steps instead of {config.num_inference_steps} a chunk took "
-                f"{halved.p50:.1f} ms instead of {chunk.p50:.1f} (--policy.num_inference_steps; check the success rate)."
+                f"Denoising takes {share:.0%}: with {fewer[-1]} steps instead of {own} a chunk took "
+                f"{steps[fewer[-1]].p50:.1f} ms instead of {steps[own].p50:.1f} (--policy.num_inference_steps; check the "
+                "success rate)."
             )
         if name in ("vision and text", "prefix") and cameras > 1:
             advice.append(f"{name.capitalize()} takes {share:.0%} for {cameras} cameras: it grows with each.")

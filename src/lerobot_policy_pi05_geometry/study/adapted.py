@@ -7,7 +7,7 @@ from typing import Any
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from ..checkpoint.load import LoadedPolicy, load_policy
+from ..checkpoint.load import LoadedPolicy
 from ..sim.configuration import MetaworldRgbdEnv
 from ..sim.environment import FPS
 from .conditions import find_condition
@@ -55,7 +55,7 @@ class AdaptedRun(SimulatedRun):
             self.demonstration(condition).make(report_progress)
 
     def load(self, condition: str, environment: MetaworldRgbdEnv) -> LoadedPolicy:
-        loaded = load_policy(self.checkpoint, self.budget.device, environment)
+        loaded = super().load(condition, environment)
         demonstration, config = self.demonstration(condition), loaded.policy.config
         dataset = LeRobotDataset(
             demonstration.repo_id,

@@ -57,6 +57,8 @@ ARMS = {
         _DEPTH_AND_POSE,
         **{f"depth_augmentation.{name}": size for name, size in _AUGMENTATION.items()},
     ),
+    "noise-times": _geometry("flow times drawn closer to noise, from Beta(4, 1)", time_sampling_beta_alpha="4.0"),
+    "uniform-times": _geometry("flow times drawn evenly", time_sampling_beta_alpha="1.0"),
     "parallel": _geometry("parallel positions", geometry_positions="parallel"),
     "camera-frame": _geometry("points in the camera's frame", frozenset({DEPTH}), geometry_frame="camera"),
     "grid-4": _geometry("4 x 4 cells", geometry_grid="4"),

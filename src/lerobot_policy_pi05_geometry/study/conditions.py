@@ -1,11 +1,11 @@
-"""Conditions of an evaluation: the range of camera poses and the faults of the depth sensor."""
+"""Conditions of an evaluation: the range of camera poses, the faults of the depth sensor, the number of denoising steps."""
 
 from dataclasses import dataclass
 
 from ..sim.cameras import azimuth_range, find_range
 from .arms import DEPTH, POSE, Arm
 
-_AZIMUTH = "azimuth"
+_AZIMUTH, _STEPS = "azimuth", "steps-"
 
 
 @dataclass(frozen=True)
@@ -13,12 +13,14 @@ class Condition:
     """One condition. cameras: range of camera poses (sim/cameras.py). sensor: depth sensor (sim/sensor.py).
 
     changes: what the sensor's fault changes, depth or the camera's pose; None for an ideal sensor.
+    denoising_steps: of a chunk; None: the checkpoint's own.
     """
 
     title: str
     cameras: str = "train"
     sensor: str = "ideal"
     changes: str | None = None
+    denoising_steps: int | None = None
 
 
 CONDITIONS = {
@@ -43,6 +45,12 @@ def azimuth_of(name: str) -> float | None:
     return float(name.removeprefix(_AZIMUTH)) if name.startswith(_AZIMUTH) else None
 
 
+def steps_of(name: str) -> int | None:
+    """Denoising steps of a condition `steps-3`; None for any other condition."""
+    count = name.removeprefix(_STEPS)
+    return int(count) if name.startswith(_STEPS) and count.isdecimal() and int(count) > 0 else None
+
+
 def find_condition(name: str) -> Condition:
     """The condition of this name. Raises ValueError that lists the known names."""
     if name in CONDITIONS:
@@ -50,7 +58,12 @@ def find_condition(name: str) -> Condition:
     if name.startswith(_AZIMUTH):
         find_range(name)
         return Condition(f"camera at {name.removeprefix(_AZIMUTH)} degrees", cameras=name)
-    raise ValueError(f"There is no condition '{name}'; choose one of: {', '.join(CONDITIONS)}.")
+    if (count := steps_of(name)) is not None:
+        return Condition(f"{count} denoising step{'s' * (count > 1)}", denoising_steps=count)
+    raise ValueError(
+        f"There is no condition '{name}'; choose one of: {', '.join(CONDITIONS)}, azimuth and degrees (azimuth-30), steps and a "
+        "number of denoising steps (steps-3)."
+    )
 
 
 def equivalent_condition(name: str, arm: Arm) -> str:
