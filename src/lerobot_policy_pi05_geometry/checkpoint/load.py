@@ -37,7 +37,7 @@ def load_policy(
     config.pretrained_path = Path(checkpoint)
     config.device = device
     if num_inference_steps is not None:
-        config.num_inference_steps = num_inference_steps  # type: ignore[attr-defined]
+        config.num_inference_steps = num_inference_steps
     if config.use_peft:
         policy = _fold_lora(checkpoint, config)
     elif environment is None:
