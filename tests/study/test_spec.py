@@ -56,7 +56,15 @@ def test_the_default_study_is_the_one_that_was_promised(tmp_path):
     assert spec.budget.evaluation_episodes >= 50
     conditions = {(run.task, run.arm_name): set(run.conditions) for run in runs_of(spec, tmp_path)}
     arms = {task: {arm for t, arm in conditions if t == task} for task, _ in conditions}
-    of_other_studies = {"rgb+rays", "rgb+modulation", "augmented", "noise-times", "uniform-times", "even-dropout"}
+    of_other_studies = {
+        "rgb+rays",
+        "rgb+modulation",
+        "augmented",
+        "noise-times",
+        "uniform-times",
+        "even-dropout",
+        "pooled",
+    }
     assert max(arms.values(), key=len) == set(ARMS) - of_other_studies
     assert len(arms) >= 3
     for task, on_task in arms.items():

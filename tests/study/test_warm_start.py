@@ -9,9 +9,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetad
 from safetensors.torch import load_file
 
 from lerobot_policy_pi05_geometry.geometry.dataset_calibration import read_dataset_calibration
+from lerobot_policy_pi05_geometry.study.arms import ARMS
 from lerobot_policy_pi05_geometry.study.frames_in_memory import FramesInMemory
 from lerobot_policy_pi05_geometry.study.plan import runs_of
 from lerobot_policy_pi05_geometry.study.spec import Budget, Comparison, Pretraining, StudySpec
+from lerobot_policy_pi05_geometry.study.warm_start import make_start, remaining_options
 from lerobot_policy_pi05_geometry.study.worker import execute
 
 pytestmark = [pytest.mark.train, pytest.mark.sim]
@@ -94,3 +96,12 @@ def test_an_adapted_arm_trains_nothing_of_its_own(runs):
     untrained = dataclasses.replace(run, seed=7)
     with pytest.raises(FileNotFoundError, match="has not been trained"):
         untrained.prepare(lambda *_: None)
+
+
+@pytest.mark.parametrize("arm", ["grid-4", "pooled"])
+def test_what_defines_new_weights_is_decided_by_the_conversion(arm, runs, tmp_path):
+    make_start(runs["pretraining"].pi05, tmp_path / "start", ARMS[arm], seed=0)
+    config = PreTrainedConfig.from_pretrained(tmp_path / "start")
+    given = {name.removeprefix("policy."): value for name, value in ARMS[arm].options.items()}
+    assert {name: str(getattr(config, name)) for name in given} == given
+    assert remaining_options(ARMS[arm]) == {}

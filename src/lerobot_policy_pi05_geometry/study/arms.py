@@ -52,6 +52,9 @@ ARMS = {
     "flow-time": _geometry("segment conditioned on the current flow time", geometry_time="denoise"),
     "own-expert": _geometry("an expert of its own for geometry", geometry_expert="own"),
     "dropout": _geometry("geometry masked in half of the training samples", geometry_dropout="0.5"),
+    "pooled": _geometry(
+        "points of a cell pooled by a learned map instead of their statistics", geometry_tokens="points"
+    ),
     "even-dropout": _geometry(
         "cameras masked in 30 % of the training samples, geometry in 40 %", image_dropout="0.3", geometry_dropout="0.4"
     ),

@@ -9,18 +9,19 @@ from .arms import Arm
 from .locks import folder_lock
 
 # Options that `convert` decides, since they define new weights.
-_CONVERTED = ("geometry_source", "geometry_grid", "geometry_frame", "geometry_expert")
+_CONVERTED = ("geometry_source", "geometry_grid", "geometry_frame", "geometry_expert", "geometry_tokens")
 
 
 def geometry_start(arm: Arm) -> GeometryStart:
     """The geometry that an arm's checkpoint is converted to."""
-    source, grid, frame, expert = (arm.options.get(f"policy.{name}") for name in _CONVERTED)
+    source, grid, frame, expert, tokens = (arm.options.get(f"policy.{name}") for name in _CONVERTED)
     return GeometryStart(
         source,
         cameras=None if source == "none" else (CAMERA,),
         grid=None if grid is None else int(grid),
         frame=frame,
         expert=expert,
+        tokens=tokens,
     )
 
 
