@@ -7,8 +7,11 @@ completely or not at all, and training restarts from the same seed. A lock keeps
 
 import json
 import logging
+import os
 import shutil
 import sys
+import threading
+import time
 from pathlib import Path
 
 from . import adapted, held_out, pretraining, simulated
@@ -39,11 +42,27 @@ def execute(run: Run) -> None:
             run.evaluate(condition, _log_progress)
 
 
+def end_with_parent(poll: float = 1.0) -> None:
+    """End this process when the one that started it has ended, however it did: nobody else would end a run then.
+
+    poll: seconds between two looks.
+    """
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(poll)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def _log_progress(stage: str, done: int, total: int) -> None:
     logger.warning("%s %s %d/%d", PROGRESS, stage, done, total)
 
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    end_with_parent()
     content = json.loads(Path(sys.argv[1]).read_text())
     execute(_KINDS[content["kind"]](content))
