@@ -36,7 +36,10 @@ def demo(
 def study(
     context: typer.Context,
     spec: Annotated[
-        str, typer.Option(help="A study's TOML file, or the name of one: warm-start, default, longer, demo, smoke.")
+        str,
+        typer.Option(
+            help="A study's TOML file, or the name of one: warm-start, warm-start-short, few-steps, default, longer, demo, smoke."
+        ),
     ] = "default",
     output: Output = Path("study"),
     workers: Workers = None,
