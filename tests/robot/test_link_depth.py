@@ -19,7 +19,7 @@ from lerobot_policy_pi05_geometry.robot.link_depth import ArmShape, check_link_d
 from lerobot_policy_pi05_geometry.robot.link_files import read_links
 from lerobot_policy_pi05_geometry.sim.headless import mujoco
 from pi05_geometry_cli import app
-from tests.geometry.arms import JOINTS, STATE_NAMES
+from tests.geometry.arms import JOINTS, STATE_NAMES, URDF, mjcf_of, so101_like
 from tests.robot.stubs import DEPTH_SCALE, HEIGHT, WIDTH, World, intrinsics, scene_xml, true_calibration
 
 pytestmark = pytest.mark.sim
@@ -154,17 +154,14 @@ def test_what_cannot_be_checked_is_said(world, recorded, folder):
     assert "no depth of camera 'top'" in refused(camera="top")
     calibration.cameras["front"].extrinsics = None
     assert "'front' has no pose; find it with" in refused()
-    body = "<body name='a'><joint name='j'/><geom size='0.1'/></body>"
-    (folder / "bare.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    (folder / "bare.xml").write_text(mjcf_of(so101_like()))
     assert "no shape on any link that the state moves" in refused("wrist", model="bare.xml")
     (folder / "bad.xml").write_text("<mujoco><worldbody><geom type='mesh' mesh='m'/></worldbody></mujoco>")
     assert "the file's meshes are needed, too" in refused("wrist", model="bad.xml")
 
 
-def test_a_urdf_gives_the_same_rays_as_an_mjcf(world, folder):
-    """MuJoCo joins a URDF's fixed links and its base with what carries them."""
-    from tests.geometry.arms import URDF
-
+def mounted_urdf(mount: str) -> str:
+    """The arm with boxes of 10 cm on its links, on a stand. mount: `stand_T_base` as attributes of URDF's origin."""
     box = '<collision><origin xyz="0 0 0.05"/><geometry><box size="0.03 0.03 0.1"/></geometry></collision>'
     mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     urdf = URDF
@@ -172,10 +169,30 @@ def test_a_urdf_gives_the_same_rays_as_an_mjcf(world, folder):
         urdf = urdf.replace(
             f'<link name="{name}"/>', f'<link name="{name}">{mass}{box if name != "jaw" else ""}</link>'
         )
-    (folder / "arm.urdf").write_text(urdf)
-    arm = true_calibration(world).arms["arm"]
-    arm.links = read_links(folder / "arm.urdf")
-    shape = ArmShape(folder / "arm.urdf", arm)
+    stand = f'<joint name="stand_base" type="fixed"><parent link="stand"/><child link="base"/><origin {mount}/></joint>'
+    return urdf.replace("</robot>", f'<link name="stand"/>{stand}</robot>')
+
+
+def mounted_mjcf(mount: str) -> str:
+    """The same as MuJoCo reads it, with bodies that it does not join: a stand, and the base on it."""
+    spec = mujoco.MjSpec.from_string(mounted_urdf(mount).replace("<link", MJCF_OPTIONS + "<link", 1))
+    spec.compile()
+    return spec.to_xml()
+
+
+MJCF_OPTIONS = '<mujoco><compiler fusestatic="false"/></mujoco>'
+MOUNTS = ('xyz="0 0 0"', 'xyz="0.4 -0.3 0.7"', 'xyz="0.4 -0.3 0.7" rpy="0.5 -0.4 1.2"')
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("write", [mounted_urdf, mounted_mjcf])
+def test_rays_do_not_depend_on_where_the_file_puts_the_base(write, mount, folder):
+    """MuJoCo joins a URDF's fixed links, and its base, with what carries them: the base may be no body of its own."""
+    file = folder / "mounted.xml"
+    file.write_text(write(mount))
+    arm = so101_like()
+    arm.links = read_links(file, "base")
+    shape = ArmShape(file, arm)
     state = torch.tensor([[10.0, -20.0, 15.0, 5.0, -30.0, 0.0]], dtype=torch.float64)
     values = shape.kinematics.values(state)
     poses = shape.kinematics.poses(values)[0].numpy()
@@ -183,3 +200,19 @@ def test_a_urdf_gives_the_same_rays_as_an_mjcf(world, folder):
     camera = link @ np.array([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.2], [0, 0, 0, 1.0]])
     found = shape.depth(values[0].numpy(), camera, np.array([[0.0, 0.0, 1.0], [0.14, 0.1, 1.0], [9.0, 0.0, 1.0]]))
     np.testing.assert_allclose(found, [0.1, 0.1, np.nan], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"upper_arm"', '"biceps"', "no link 'upper_arm' on joint 'shoulder_lift', as the arm has"),
+        ('name="elbow_flex" type="revolute"', 'name="elbow_flex" type="fixed"', "no link 'lower_arm' on joint"),
+        ("0 0 0.135", "0 0 0.136", r"Link '\w+' of .* stands elsewhere than the arm's"),
+        ('<axis xyz="0 0 2"/>', '<axis xyz="0 1 0"/>', r"Link '\w+' of .* stands elsewhere than the arm's"),
+    ],
+)
+def test_the_file_of_another_arm_is_refused(old, new, said, folder):
+    (folder / "other.urdf").write_text(mounted_urdf(MOUNTS[2]).replace(old, new))
+    with pytest.raises(ValueError, match=f"{said}.*give the link file that `pi05-geometry calibrate arm` read") as told:
+        ArmShape(folder / "other.urdf", so101_like())
+    assert "\n" not in str(told.value)

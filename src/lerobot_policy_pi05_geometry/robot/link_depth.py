@@ -27,6 +27,8 @@ _FRAMES = 30
 _ACROSS = 80  # columns and rows of rays, at most
 _NEAREST = 0.05  # metres: what is nearer, the camera's own mount say, no depth camera measures
 _FARTHEST = 100.0  # metres: depth whose scale is wrong is ten times too far
+_SAME_PLACE = 1e-4  # metres, and entries of a rotation
+_SAME_FILE = "give the link file that `pi05-geometry calibrate arm` read"
 
 
 class LinkDepth(NamedTuple):
@@ -38,7 +40,10 @@ class LinkDepth(NamedTuple):
 
 
 class ArmShape:
-    """Shapes of an arm's links. path: of its URDF or MJCF file, with its meshes beside it."""
+    """Shapes of an arm's links. path: of its URDF or MJCF file, with its meshes beside it.
+
+    Raises ValueError where MuJoCo cannot read the file, or the file's links stand otherwise to each other than the arm's.
+    """
 
     def __init__(self, path: Path, arm: Arm) -> None:
         self._mujoco = _mujoco()
@@ -56,20 +61,23 @@ class ArmShape:
         # A link whose place the state does not tell is none to measure.
         placed = [name for name in moved if not ForwardKinematics(arm, [name]).unknown_joints]
         self._bodies = [bodies[name] for name in placed if name in bodies and bodies[name] > 0]
-        self._root = bodies.get(arm.links[0].name, 0)
-        self._joints = self._addresses(bodies)
+        self._joints = self._addresses(bodies, path)
+        self._world_T_base = self._find_base(bodies, path)
         if not np.isin(self.model.geom_bodyid, self._bodies).any():
             raise ValueError(
                 f"{path} has no shape on any link that the state moves; give a link file with meshes or geoms."
             )
 
-    def _addresses(self, bodies: dict[str, int]) -> list[tuple[int, int, float, float]]:
+    def _addresses(self, bodies: dict[str, int], path: Path) -> list[tuple[int, int, float, float]]:
         """Per joint of MuJoCo that the state moves: its place in qpos, that of its value, scale and shift."""
         found, seen = [], dict.fromkeys(bodies, 0)
         for link in self.arm.links:
-            body = link.name.partition(":")[0]  # `read_links` names the links of a body's several joints so
-            if not link.joint or body not in bodies:
+            if not link.joint:
                 continue
+            # `read_links` names the links of a body's several joints BODY:JOINT.
+            body = link.name if link.name in bodies else link.name.partition(":")[0]
+            if seen.get(body, 0) >= (self.model.body_jntnum[bodies[body]] if body in bodies else 0):
+                raise ValueError(f"{path} has no link '{body}' on joint '{link.joint}', as the arm has; {_SAME_FILE}.")
             joint = int(self.model.body_jntadr[bodies[body]]) + seen[body]
             seen[body] += 1
             address = int(self.model.jnt_qposadr[joint])
@@ -77,17 +85,39 @@ class ArmShape:
             found.append((address, self.kinematics.joints.index(link.joint), link.scale, link.shift + start))
         return found
 
+    def _find_base(self, bodies: dict[str, int], path: Path) -> np.ndarray:
+        """`world_T_base` (4, 4), from where the moved links stand.
+
+        The base itself may be no body of MuJoCo's: it joins a URDF's links that no joint moves with its world.
+        """
+        values = np.full(len(self.kinematics.joints), 0.3)  # any but 0, where turned axes would not show
+        self._move(values)
+        poses = self.kinematics.poses(torch.from_numpy(values)[None])[0].numpy()
+        there = [(name, pose) for name, pose in zip(self.kinematics.links, poses, strict=True) if name in bodies]
+        bases = [self._pose(bodies[name]) @ np.linalg.inv(pose) for name, pose in there]
+        for (name, _), base in zip(there, bases, strict=True):
+            if not np.allclose(base, bases[0], atol=_SAME_PLACE):
+                raise ValueError(f"Link '{name}' of {path} stands elsewhere than the arm's '{name}'; {_SAME_FILE}.")
+        return bases[0] if bases else np.eye(4)
+
+    def _move(self, values: np.ndarray) -> None:
+        for address, number, scale, shift in self._joints:
+            self.data.qpos[address] = scale * values[number] + shift
+        self._mujoco.mj_kinematics(self.model, self.data)
+
+    def _pose(self, body: int) -> np.ndarray:
+        """`world_T_body` (4, 4)."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.data.xmat[body].reshape(3, 3), self.data.xpos[body]
+        return pose
+
     def depth(self, values: np.ndarray, base_T_camera: np.ndarray, rays: np.ndarray) -> np.ndarray:  # noqa: N803
         """How far the arm is along the optical axis, (N,) metres; NaN where a ray hits none of its links first.
 
         values: of `kinematics.joints`, radians or metres. rays: (N, 3) in the camera's frame, z = 1.
         """
-        for address, number, scale, shift in self._joints:
-            self.data.qpos[address] = scale * values[number] + shift
-        self._mujoco.mj_kinematics(self.model, self.data)
-        root = np.eye(4)
-        root[:3, :3], root[:3, 3] = self.data.xmat[self._root].reshape(3, 3), self.data.xpos[self._root]
-        camera = root @ np.linalg.inv(np.array(self.arm.base_T_root)) @ base_T_camera
+        self._move(values)
+        camera = self._world_T_base @ base_T_camera
         lengths = np.linalg.norm(rays, axis=1)
         directions = (rays / lengths[:, None]) @ camera[:3, :3].T
         # One by one, at 4 microseconds each: mj_multiRay of MuJoCo 3.3 misses shapes near the rays' origin.
