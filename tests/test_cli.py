@@ -64,3 +64,22 @@ def test_conversion_and_back(tmp_path):
     assert (config["geometry_grid"], config["geometry_gate_openness"], config["input_features"]) == (5, 0.01, {})
     assert json.loads((back / "config.json").read_text())["type"] == "pi05"
     assert "exists already" in fail("export", str(policy), str(back))
+
+
+@pytest.mark.parametrize("command", [["bench"], ["export"]])
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [({"of_a_later_version": 1}, "of_a_later_version"), ({"geometry_grid": 0}, "geometry_grid must be at least 1")],
+)
+def test_settings_that_do_not_fit_are_told_in_one_sentence(command, setting, said, tmp_path):
+    policy = tmp_path / "policy"
+    arguments = ["convert", str(write_lerobot(tmp_path / "source")), str(policy), "--geometry-source=none"]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    config = json.loads((policy / "config.json").read_text())
+    (policy / "config.json").write_text(json.dumps(config | setting))
+    result = CliRunner().invoke(
+        app, [*command, str(policy), *([str(tmp_path / "out")] if command == ["export"] else [])]
+    )
+    assert isinstance(result.exception, ValueError)
+    assert "do not fit this version of the policy" in str(result.exception)
+    assert said in str(result.exception)

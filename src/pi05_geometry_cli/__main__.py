@@ -25,7 +25,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", module="gymnasium")
     try:
         app()
-    except (ValueError, FileNotFoundError, FileExistsError, ModuleNotFoundError, RuntimeError, OSError) as error:
+    except (ValueError, ImportError, RuntimeError, OSError) as error:
         if os.environ.get("PI05_GEOMETRY_TRACEBACK"):
             raise
         console.print(f"[bold red]Error[/bold red] {escape(str(error))}", soft_wrap=True)

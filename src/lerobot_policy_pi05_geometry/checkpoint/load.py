@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import draccus
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy, make_pre_post_processors
 
+from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..modeling_pi05_geometry import PI05GeometryPolicy
 from ..weight_files.files import require_policy_type
 
@@ -32,8 +34,7 @@ def load_policy(
     chunk, instead of the checkpoint's.
     Raises FileNotFoundError or ValueError if it is not a checkpoint of this policy.
     """
-    require_policy_type(checkpoint, PI05GeometryPolicy.name)
-    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config = read_config(checkpoint)
     config.pretrained_path = Path(checkpoint)
     config.device = device
     if num_inference_steps is not None:
@@ -50,6 +51,21 @@ def load_policy(
         preprocessor_overrides={"device_processor": {"device": device}},
     )
     return LoadedPolicy(policy, preprocess, postprocess)
+
+
+def read_config(checkpoint: str | Path, **hub: Any) -> PI05GeometryConfig:
+    """The configuration of a checkpoint of this policy.
+
+    Raises FileNotFoundError if there is none, ValueError if it is another policy's or has a setting that this version does not.
+    """
+    require_policy_type(checkpoint, PI05GeometryPolicy.name, **hub)
+    try:
+        config = PreTrainedConfig.from_pretrained(checkpoint, **hub)
+    except draccus.ParsingError as error:  # of the configuration's own sentences it is the cause
+        told = error if isinstance(error, draccus.utils.DecodingError) else error.__cause__ or error
+        raise ValueError(f"The settings of {checkpoint} do not fit this version of the policy: {told}") from error
+    assert isinstance(config, PI05GeometryConfig)
+    return config
 
 
 def _fold_lora(checkpoint: str | Path, config: PreTrainedConfig) -> PI05GeometryPolicy:

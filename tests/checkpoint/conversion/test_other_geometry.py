@@ -326,3 +326,19 @@ def test_lora_is_merged_first(rgbd, tmp_path) -> None:
     (source / "adapter_config.json").write_text("{}")
     with pytest.raises(ValueError, match="was trained with LoRA; merge it first"):
         convert(source, tmp_path / "output", GeometryStart(grid=2))
+
+
+@pytest.mark.parametrize(
+    ("geometry", "options", "said"),
+    [
+        ({"grid": 0}, {}, "--geometry-grid must be at least 1, got 0"),
+        ({"frame": ""}, {}, "geometry_frame must be one of .*, got ''"),
+        ({"source": ""}, {}, "geometry-source must be one of .*, got ''"),
+        ({"grid": 4}, {"chunk_size": 4}, "--chunk-size is for an openpi checkpoint"),
+        ({"grid": 4}, {"tokenizer": "./mine"}, "carries its tokenizer; leave --tokenizer-path out"),
+    ],
+)
+def test_what_is_given_is_never_left_as_it_was(geometry, options, said, converted, tmp_path):
+    with pytest.raises(ValueError, match=said):
+        convert(converted, tmp_path / "output", GeometryStart(**geometry), **options)
+    assert not folder_contents(tmp_path)

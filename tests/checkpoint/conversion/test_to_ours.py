@@ -103,6 +103,35 @@ def test_openpi_without_a_config_needs_a_chunk_size(tmp_path):
     assert PreTrainedConfig.from_pretrained(tmp_path / "output").chunk_size == 11
 
 
+@pytest.mark.parametrize(
+    ("geometry", "options", "said"),
+    [
+        ({"grid": 0}, {}, "--geometry-grid must be at least 1, got 0"),
+        ({"frame": ""}, {}, "geometry_frame must be one of .*, got ''"),
+        ({"expert": ""}, {}, "geometry_expert must be one of .*, got ''"),
+        ({"tokens": ""}, {}, "geometry_tokens must be one of .*, got ''"),
+        ({"source": ""}, {}, "geometry-source must be one of .*, got ''"),
+        ({}, {"chunk_size": 4}, "--chunk-size is for an openpi checkpoint"),
+    ],
+)
+def test_what_is_given_is_never_replaced_by_a_default(geometry, options, said, lerobot_source, tmp_path):
+    with pytest.raises(ValueError, match=said):
+        convert(lerobot_source, tmp_path / "output", GeometryStart(**geometry), **options)
+    assert not folder_contents(tmp_path)
+
+
+def test_a_chunk_of_no_actions_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="chunk_size must be at least 1, got 0"):
+        convert(write_openpi(tmp_path / "source"), tmp_path / "output", chunk_size=0)
+
+
+@pytest.mark.parametrize("features", [["front"], {FRONT: ["VISUAL"]}, {FRONT: {"shape": [3, 28, 28]}}])
+def test_input_features_that_are_none_are_named(features, tmp_path):
+    source = write_lerobot(tmp_path / "source", input_features=features)
+    with pytest.raises(ValueError, match="input_features"):
+        convert(source, tmp_path / "output")
+
+
 def test_dtypes_stay_as_they_are_stored(tmp_path):
     source = write_lerobot(tmp_path / "source", in_other_dtypes)
     convert(source, tmp_path / "output", GeometryStart(source="none"))

@@ -42,6 +42,8 @@ class GeometryStart:
         """Raise ValueError for options that do not belong together. source: the geometry source that results."""
         if source not in SOURCES + CONTROLS:
             raise ValueError(f"--geometry-source must be one of {', '.join(SOURCES + CONTROLS)}, got {source!r}.")
+        if self.grid is not None and self.grid < 1:
+            raise ValueError(f"--geometry-grid must be at least 1, got {self.grid}.")
         if self.encoder is not None and source not in ("da3", "features"):
             raise ValueError(
                 f"--da3-encoder belongs to --geometry-source=da3 or features, but this is {source}; leave it out."
@@ -54,18 +56,18 @@ class GeometryStart:
 
         Parallel positions leave the actions where π0.5 has them.
         """
-        source = self.source or "rgbd"
+        source = value_or(self.source, "rgbd")
         self.check(source)
         known = source == "none" or (source in FROM_RGB and has_images)
         return {
             "geometry_source": source,
             "geometry_cameras": None if self.cameras is None else list(self.cameras),
             "geometry_pending": 0 if known else len(self.cameras or [""]),
-            "geometry_grid": self.grid or 8,
-            "geometry_frame": self.frame or "base",
-            "geometry_expert": self.expert or "shared",
-            "geometry_tokens": self.tokens or "statistics",
-            "geometry_gate_openness": SHUT if self.openness is None else self.openness,
+            "geometry_grid": value_or(self.grid, 8),
+            "geometry_frame": value_or(self.frame, "base"),
+            "geometry_expert": value_or(self.expert, "shared"),
+            "geometry_tokens": value_or(self.tokens, "statistics"),
+            "geometry_gate_openness": value_or(self.openness, SHUT),
             "geometry_positions": "parallel",
             "padded_actions": "supervised",  # as it was trained
             "da3_encoder": (self.encoder or DEFAULT_ENCODER) if source in ("da3", "features") else None,
@@ -80,7 +82,12 @@ class GeometryStart:
             config.calibration_given = True
 
 
+def value_or[T](value: T | None, default: T) -> T:
+    """A grid of 0 or an empty name is no default: the configuration refuses it."""
+    return default if value is None else value
+
+
 def has_images(settings: Mapping[str, Any]) -> bool:
     """Whether configuration fields name an RGB camera, as JSON."""
     inputs = settings.get("input_features") or {}
-    return any(feature["type"] == "VISUAL" for feature in inputs.values())
+    return any(isinstance(feature, Mapping) and feature.get("type") == "VISUAL" for feature in inputs.values())

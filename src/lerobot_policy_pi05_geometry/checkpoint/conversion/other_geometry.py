@@ -30,7 +30,7 @@ from ...geometry.da3.weights import meta_da3
 from ...geometry.depth_augmentation import DepthAugmentation
 from ...geometry.resolve import FROM_RGB, camera_names
 from ...weight_files.strict_load import complain
-from .geometry_start import SHUT, TAKE_UP, GeometryStart
+from .geometry_start import SHUT, TAKE_UP, GeometryStart, value_or
 from .settings import NOT_CARRIED, make_config
 from .start import ADAPTER, GATE, OWN_EXPERT, STEP, inherited_shapes, is_new, meta_policy, start_values
 from .tensor_file import StoredTensor, check_weights, read_tensor
@@ -97,13 +97,13 @@ def _up_to_date(described_by: Mapping[str, Any]) -> dict[str, Any]:
 def _plan(before: PI05GeometryConfig, start: GeometryStart, features_from_data: bool) -> _Change:
     """The configuration with another geometry, and what follows for the parameters."""
     after = deepcopy(before)
-    after.geometry_source = start.source or before.geometry_source
+    after.geometry_source = value_or(start.source, before.geometry_source)
     start.check(after.geometry_source)
-    after.geometry_grid = start.grid or before.geometry_grid
-    after.geometry_frame = start.frame or before.geometry_frame
-    after.geometry_expert = start.expert or before.geometry_expert
+    after.geometry_grid = value_or(start.grid, before.geometry_grid)
+    after.geometry_frame = value_or(start.frame, before.geometry_frame)
+    after.geometry_expert = value_or(start.expert, before.geometry_expert)
     same_kind = (after.geometry_source in _DA3) == (before.geometry_source in _DA3)
-    after.geometry_tokens = start.tokens or (before.geometry_tokens if same_kind else "statistics")
+    after.geometry_tokens = value_or(start.tokens, before.geometry_tokens if same_kind else "statistics")
     if after.geometry_source != "rgbd":  # augmentation of what is not measured any more would be refused
         after.depth_augmentation = DepthAugmentation()
     elif after.geometry_frame != "base":
@@ -118,7 +118,7 @@ def _plan(before: PI05GeometryConfig, start: GeometryStart, features_from_data: 
     features = _meaning(before) != _meaning(after)
     gate = features or start.openness is not None
     if gate and after.geometry_placement == "segment":
-        after.geometry_gate_openness = SHUT if start.openness is None else start.openness
+        after.geometry_gate_openness = value_or(start.openness, SHUT)
     if features and after.geometry_source != "none":
         for name, value in TAKE_UP.items():
             setattr(after, name, value)

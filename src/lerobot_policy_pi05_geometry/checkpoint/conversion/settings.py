@@ -49,14 +49,19 @@ def from_lerobot(source: Mapping[str, Any], path: object) -> dict[str, Any]:
         logger.warning("%s has settings that this policy does not have, left out: %s.", path, ", ".join(lost))
     settings = {name: value for name, value in source.items() if name in known - NOT_CARRIED}
     # LeRobot keeps the empty cameras it adds among the inputs; here they are added on the other side of `validate_features`.
-    inputs = (settings.get("input_features") or {}).items()
+    features = settings.get("input_features") or {}
+    if not isinstance(features, Mapping):
+        raise ValueError(
+            f"{path} is no policy configuration: its input_features must be an object of features by name."
+        )
+    inputs = features.items()
     return settings | {"input_features": {key: value for key, value in inputs if not key.startswith(EMPTY_CAMERA)}}
 
 
 def from_openpi(source: Mapping[str, Any], chunk_size: int | None, path: object) -> dict[str, Any]:
     """Fields that the config.json of an openpi checkpoint tells; {} where it has none. chunk_size: if it is given."""
     settings = {ours: source[theirs] for theirs, ours in _OPENPI.items() if theirs in source}
-    chunk_size = chunk_size or settings.get("chunk_size")
+    chunk_size = settings.get("chunk_size") if chunk_size is None else chunk_size
     if chunk_size is None:
         raise ValueError(
             f"{path} does not say how many actions a chunk has (openpi's action_horizon), and neither do its weights; give "

@@ -7,12 +7,11 @@ from typing import Any
 
 from accelerate import init_empty_weights
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
-from lerobot.configs import PreTrainedConfig
 
-from ...configuration_pi05_geometry import PI05GeometryConfig
 from ...model.variants import EXPERT_VARIANTS
 from ...modeling_pi05_geometry import PI05GeometryPolicy
-from ...weight_files.files import CONFIG_FILE, find_file, new_folder, require_policy_type
+from ...weight_files.files import CONFIG_FILE, find_file, new_folder
+from ..load import read_config
 from .names import EMBEDDING, EXPERT_HEAD, PREFIX, VLM_HEAD
 from .processors import processors_to_lerobot
 from .settings import to_lerobot
@@ -31,14 +30,12 @@ def export(source: str | Path, output: Path, **hub: Any) -> None:
     source: folder or hub id of a checkpoint of this policy. hub: arguments of `hf_hub_download`.
     Raises ValueError, FileNotFoundError, FileExistsError or OSError, with one sentence; then nothing is left behind.
     """
-    require_policy_type(source, PI05GeometryPolicy.name, **hub)
+    config = read_config(source, **hub)
 
     def find(name: str) -> Path:
         return find_file(source, name, **hub)
 
     file = find(SAFETENSORS_SINGLE_FILE)
-    config = PreTrainedConfig.from_pretrained(source, **hub)
-    assert isinstance(config, PI05GeometryConfig)
     if config.paligemma_variant != "gemma_2b":
         logger.warning(
             "LeRobot builds the released sizes only, so it will not load this checkpoint of paligemma_variant=%s.",

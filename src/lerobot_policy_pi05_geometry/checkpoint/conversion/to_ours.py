@@ -65,6 +65,15 @@ def convert(
     ours = kind == PI05GeometryPolicy.name
     if ours and find_optional_file(source, ADAPTER_CONFIG, **hub) is not None:
         raise ValueError(f"{source} was trained with LoRA; merge it first (`pi05-geometry merge {source} MERGED`).")
+    if chunk_size is not None and kind is not None:
+        raise ValueError(
+            f"--chunk-size is for an openpi checkpoint; the actions of a chunk of {source} are its own setting, so leave "
+            "it out."
+        )
+    if ours and tokenizer is not None:
+        raise ValueError(
+            f"{source} is a checkpoint of this policy and carries its tokenizer; leave --tokenizer-path out."
+        )
     file = find(SAFETENSORS_SINGLE_FILE)
     stored = read_tensors(file)
     if ours:
