@@ -332,6 +332,20 @@ def test_a_saved_policy_acts_as_before_bit_for_bit(tmp_path, changes):
     loss.backward()
 
 
+@pytest.mark.parametrize("changes", [{}, {"dtype": "bfloat16", "param_dtype": "bfloat16"}], ids=["float32", "bfloat16"])
+def test_a_policy_that_has_acted_is_saved_as_it_was_before(tmp_path, changes):
+    """As lerobot-train does it: evaluate, then save, then train on. The runner joins weights in larger matrices."""
+    policy, batch = make_policy(**changes), make_batch()
+    policy.save_pretrained(tmp_path / "before")
+    chunk = chunk_of(policy, batch)
+    policy.save_pretrained(tmp_path / "after")
+    policy.train()
+    policy.save_pretrained(tmp_path / "trained")
+    files = [(tmp_path / name / "model.safetensors").read_bytes() for name in ("before", "after", "trained")]
+    assert files[0] == files[1] == files[2]
+    assert torch.equal(chunk_of(PI05GeometryPolicy.from_pretrained(tmp_path / "after"), batch), chunk)
+
+
 def test_what_must_stay_float32_does():
     policy = make_policy(dtype="bfloat16", param_dtype="bfloat16")
     dtypes = {name: parameter.dtype for name, parameter in policy.named_parameters()}

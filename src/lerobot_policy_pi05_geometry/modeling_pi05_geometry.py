@@ -24,6 +24,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.common.vla_utils import pad_vector
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from .compat import make_rtc_processor
@@ -165,6 +166,18 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         policy.to(config.device)
         policy.eval()
         return policy
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        """Write configuration and weights. LeRobot calls this.
+
+        After acting, weights are parts of the runner's larger matrices, which LeRobot's own way of writing refuses.
+        """
+        if state_dict is not None:  # gathered from shards
+            super()._save_pretrained(save_directory, state_dict)
+            return
+        self.config._save_pretrained(save_directory)
+        tensors = {name: tensor.contiguous() for name, tensor in self.state_dict().items()}
+        save_file(tensors, save_directory / SAFETENSORS_SINGLE_FILE, metadata={"format": "pt"})
 
     @property
     def training_step(self) -> Tensor:

@@ -3,6 +3,7 @@
 import pandas as pd
 
 from lerobot_policy_pi05_geometry.study.report import headline
+from lerobot_policy_pi05_geometry.study.results import cells
 
 
 def table(rates: dict[tuple[str, str], int], condition: str = "outside") -> pd.DataFrame:
@@ -60,3 +61,10 @@ def test_the_difference_is_averaged_over_tasks_and_resamples_training_seeds():
 def test_without_the_outside_condition_the_best_cell_is_named():
     found = headline(table({("t", "geometry"): 3, ("t", "rgb"): 7}, condition="inside"))
     assert "The best cell of this study is rgb under 'inside': 70%" in found
+
+
+def test_every_condition_has_its_place_in_a_report():
+    """Conditions with a name of their own first, then numbers of denoising steps, fewest first."""
+    given = ["steps-10", "noise", "steps-2", "inside"]
+    rows = pd.concat([table({("t", "geometry"): 5}, condition) for condition in given])
+    assert [cell.condition for cell in cells(rows)] == ["inside", "noise", "steps-2", "steps-10"]

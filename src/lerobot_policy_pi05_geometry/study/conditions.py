@@ -51,6 +51,12 @@ def steps_of(name: str) -> int | None:
     return int(count) if name.startswith(_STEPS) and count.isdecimal() and int(count) > 0 else None
 
 
+def order_of(name: str) -> tuple[int, int]:
+    """Sorts conditions: those with a name of their own as they stand in CONDITIONS, then by denoising steps."""
+    names = list(CONDITIONS)
+    return (names.index(name) if name in names else len(names), steps_of(name) or 0)
+
+
 def find_condition(name: str) -> Condition:
     """The condition of this name. Raises ValueError that lists the known names."""
     if name in CONDITIONS:

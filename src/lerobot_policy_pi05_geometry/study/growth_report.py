@@ -11,7 +11,7 @@ from ..inspect.page import Page, picture
 from ..sim.cameras import CAMERA_RANGES
 from .arms import ARMS
 from .claims import claims
-from .conditions import CONDITIONS, azimuth_of, find_condition
+from .conditions import azimuth_of, find_condition, order_of
 from .pretraining import PretrainingRun
 from .results import cells, episodes_table, success_matrix
 from .simulated import SimulatedRun
@@ -160,7 +160,7 @@ def _task(page: Page, task: str, rows: pd.DataFrame, pictures: Path) -> None:
     page.heading(task)
     found = {(cell.arm, cell.condition): cell for cell in cells(rows)}
     arms = [arm for arm in ARMS if any(key[0] == arm for key in found)]
-    names = [name for name in CONDITIONS if any(key[1] == name for key in found)]
+    names = sorted({condition for _, condition in found}, key=order_of)
     bars = {}
     for arm in arms:
         of_arm = [found.get((arm, name)) for name in names]

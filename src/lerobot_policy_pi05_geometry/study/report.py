@@ -14,7 +14,7 @@ from ..inspect.inspection import frame_batch
 from ..inspect.page import Page, picture, video
 from ..inspect.pictures import depth_figure, layout_figure, segment_share_figure
 from .arms import ARMS
-from .conditions import CONDITIONS
+from .conditions import find_condition, order_of
 from .results import ArmComparison, Cell, cells, comparisons, episodes_table, pooled_difference
 from .simulated import SimulatedRun
 from .training_log import read_curve
@@ -143,11 +143,11 @@ def _task(
     page: Page, task: str, found: list[Cell], versus: list[ArmComparison], runs: Sequence[SimulatedRun], pictures: Path
 ) -> None:
     page.heading(task)
-    conditions = [name for name in CONDITIONS if any(cell.condition == name for cell in found)]
+    conditions = sorted({cell.condition for cell in found}, key=order_of)
     arms = [name for name in ARMS if any(cell.arm == name for cell in found)]
     by_name = {(cell.arm, cell.condition): cell for cell in found}
     bars = {arm: [_bar(by_name.get((arm, condition))) for condition in conditions] for arm in arms}
-    titles = [CONDITIONS[condition].title for condition in conditions]
+    titles = [find_condition(condition).title for condition in conditions]
     caption = "Success per arm and condition over all training seeds. The table has each training seed in brackets."
     page.row(picture(success_figure(titles, bars), caption, pictures / f"success_{task}.png"))
     parameters = {run.arm_name: _parameters(run) for run in _finished(runs) if run.task == task}
@@ -177,7 +177,7 @@ def _task(
         shown = [arm for arm in _SHOWN_IN_VIDEOS if arm in arms]
         clips = _side_by_side([run for run in runs if run.task == task], shown, condition)
         if clips is not None:
-            title = f"From left: {', '.join(shown)}. {CONDITIONS[condition].title.capitalize()}."
+            title = f"From left: {', '.join(shown)}. {find_condition(condition).title.capitalize()}."
             page.row(video(clips, 10, title, pictures / f"rollout_{task}_{condition}.mp4"))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from .arms import ARMS
-from .conditions import CONDITIONS
+from .conditions import order_of
 from .simulated import SimulatedRun
 from .statistics import Difference, bootstrap, compare, holm, wilson
 
@@ -67,14 +67,14 @@ class Cell:
 
 
 def cells(table: pd.DataFrame) -> list[Cell]:
-    """Every cell of a study, in the order of ARMS and CONDITIONS."""
+    """Every cell of a study, in the order of ARMS and of `order_of` its condition."""
     found = []
     for (task, arm, condition), rows in table.groupby(["task", "arm", "condition"], sort=False):
         crashed = rows.loc[rows["crashed"], "training_seed"].nunique()
         by_seed = tuple(rows.groupby("training_seed")["success"].mean())
         found.append(Cell(task, arm, condition, int(rows["success"].sum()), len(rows), crashed, by_seed))
-    arms, conditions = list(ARMS), list(CONDITIONS)
-    return sorted(found, key=lambda cell: (cell.task, arms.index(cell.arm), conditions.index(cell.condition)))
+    arms = list(ARMS)
+    return sorted(found, key=lambda cell: (cell.task, arms.index(cell.arm), order_of(cell.condition)))
 
 
 @dataclass(frozen=True)
