@@ -13,6 +13,7 @@ from lerobot_policy_pi05_geometry.study.conditions import (
     azimuth_of,
     equivalent_condition,
     find_condition,
+    order_of,
 )
 from lerobot_policy_pi05_geometry.study.plan import runs_of
 from lerobot_policy_pi05_geometry.study.pretraining import read_pretraining
@@ -151,6 +152,25 @@ def test_a_number_of_denoising_steps_is_a_condition():
     for wrong in ("steps-0", "steps-", "steps--1", "steps-2.5", "steps-²"):
         with pytest.raises(ValueError, match="no condition 'steps-"):
             find_condition(wrong)
+
+
+def test_any_condition_may_have_a_number_of_denoising_steps():
+    for name in (*CONDITIONS, azimuth_condition(30)):
+        plain, few = find_condition(name), find_condition(f"{name}-steps-3")
+        assert few.denoising_steps == 3
+        assert (few.cameras, few.sensor, few.changes) == (plain.cameras, plain.sensor, plain.changes)
+    rgb, geometry = ARMS["rgb"], ARMS["geometry"]
+    assert equivalent_condition("depth-off-steps-1", geometry) == "depth-off-steps-1"
+    assert equivalent_condition("depth-off-steps-1", rgb) == "steps-1"  # a file of its own would be evaluated twice
+    assert equivalent_condition("inside-steps-1", geometry) == "steps-1"
+    assert sorted(["outside-steps-1", "steps-3", "outside", "inside"], key=order_of) == [
+        "inside",
+        "steps-3",
+        "outside",
+        "outside-steps-1",
+    ]
+    with pytest.raises(ValueError, match="no condition 'nowhere'"):
+        find_condition("nowhere-steps-1")
 
 
 GROWING = (

@@ -1,11 +1,13 @@
 """Conditions of an evaluation: the range of camera poses, the faults of the depth sensor, the number of denoising steps."""
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 
 from ..sim.cameras import azimuth_range, find_range
 from .arms import DEPTH, POSE, Arm
 
-_AZIMUTH, _STEPS = "azimuth", "steps-"
+_AZIMUTH = "azimuth"
+_STEPS = re.compile(r"(?:(?P<condition>.+)-)?steps-(?P<count>[1-9][0-9]*)")
 
 
 @dataclass(frozen=True)
@@ -45,36 +47,46 @@ def azimuth_of(name: str) -> float | None:
     return float(name.removeprefix(_AZIMUTH)) if name.startswith(_AZIMUTH) else None
 
 
-def steps_of(name: str) -> int | None:
-    """Denoising steps of a condition `steps-3`; None for any other condition."""
-    count = name.removeprefix(_STEPS)
-    return int(count) if name.startswith(_STEPS) and count.isdecimal() and int(count) > 0 else None
+def split_steps(name: str) -> tuple[str, int | None]:
+    """Condition and denoising steps: "outside" and 3 of "outside-steps-3", "inside" and 3 of "steps-3", "outside" and None of "outside"."""
+    match = _STEPS.fullmatch(name)
+    return (name, None) if match is None else (match["condition"] or "inside", int(match["count"]))
+
+
+def _join_steps(condition: str, count: int | None) -> str:
+    """The inverse of `split_steps`."""
+    return condition if count is None else f"steps-{count}" if condition == "inside" else f"{condition}-steps-{count}"
 
 
 def order_of(name: str) -> tuple[int, int]:
     """Sorts conditions: those with a name of their own as they stand in CONDITIONS, then by denoising steps."""
     names = list(CONDITIONS)
-    return (names.index(name) if name in names else len(names), steps_of(name) or 0)
+    condition, steps = split_steps(name)
+    return (names.index(condition) if condition in names else len(names), steps or 0)
 
 
 def find_condition(name: str) -> Condition:
     """The condition of this name. Raises ValueError that lists the known names."""
     if name in CONDITIONS:
         return CONDITIONS[name]
+    condition, count = split_steps(name)
+    if count is not None:
+        steps = f"{count} denoising step{'s' * (count > 1)}"
+        found = find_condition(condition)
+        return replace(found, title=f"{found.title}, {steps}", denoising_steps=count)
     if name.startswith(_AZIMUTH):
         find_range(name)
         return Condition(f"camera at {name.removeprefix(_AZIMUTH)} degrees", cameras=name)
-    if (count := steps_of(name)) is not None:
-        return Condition(f"{count} denoising step{'s' * (count > 1)}", denoising_steps=count)
     raise ValueError(
-        f"There is no condition '{name}'; choose one of: {', '.join(CONDITIONS)}, azimuth and degrees (azimuth-30), steps and a "
-        "number of denoising steps (steps-3)."
+        f"There is no condition '{name}'; choose one of: {', '.join(CONDITIONS)}, azimuth and degrees (azimuth-30), or one of "
+        "these, steps and a number of denoising steps (outside-steps-3; steps-3 is inside-steps-3)."
     )
 
 
 def equivalent_condition(name: str, arm: Arm) -> str:
     """The condition to evaluate instead: a fault of what an arm does not read changes nothing for it."""
+    named, count = split_steps(name)
     condition = find_condition(name)
-    if condition.changes is None or condition.changes in arm.reads:
-        return name
-    return next(n for n, c in CONDITIONS.items() if c.cameras == condition.cameras and c.changes is None)
+    if condition.changes is not None and condition.changes not in arm.reads:
+        named = next(n for n, c in CONDITIONS.items() if c.cameras == condition.cameras and c.changes is None)
+    return _join_steps(named, count)
