@@ -48,7 +48,7 @@ def azimuth_of(name: str) -> float | None:
 
 
 def split_steps(name: str) -> tuple[str, int | None]:
-    """Condition and denoising steps: "outside" and 3 of "outside-steps-3", "inside" and 3 of "steps-3", "outside" and None of "outside"."""
+    """Condition and denoising steps: "steps-3" is "inside" with 3; a name without steps is itself, with None."""
     match = _STEPS.fullmatch(name)
     return (name, None) if match is None else (match["condition"] or "inside", int(match["count"]))
 
