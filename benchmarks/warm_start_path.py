@@ -5,7 +5,8 @@
 convert -> precompute (for features) -> lerobot-train --peft, two steps -> merge -> one action chunk. At the released size in
 bfloat16 it needs some 16 GB of memory and 25 GB of disk at SCRATCH, which it leaves as it found it. The encoder has DA3-BASE's
 architecture and random weights. Every command is the one that a user types, in a process of its own; "peak" is that process's
-largest resident set. The data are one episode of the simulated RGB-D environment.
+largest resident set. The data are one episode of the simulated RGB-D environment, or `--data`. With `--device cuda` training and
+the chunk are on a GPU.
 """
 
 import argparse
@@ -51,10 +52,18 @@ def run(name: str, command: list[str], log: Path) -> dict[str, float]:
     return found
 
 
-def commands(geometry: str, size: str, scratch: Path) -> list[tuple[str, list[str]]]:
+def program(name: str) -> str:
+    """A command of this environment. Raises FileNotFoundError."""
+    beside = Path(sys.executable).parent / name
+    if found := str(beside) if beside.exists() else shutil.which(name):
+        return found
+    raise FileNotFoundError(f"There is no command {name}; install this project as the README says.")
+
+
+def commands(geometry: str, size: str, scratch: Path, data: Path, device: str) -> list[tuple[str, list[str]]]:
     """Names and commands of the path, in order."""
-    bin_, data, run_ = Path(sys.executable).parent, scratch / "data", scratch / "run"
-    ours, train = str(bin_ / "pi05-geometry"), str(bin_ / "lerobot-train")
+    run_ = scratch / "run"
+    ours, train = program("pi05-geometry"), program("lerobot-train")
     policy, merged, encoder = scratch / "policy", scratch / "merged", scratch / "encoder"
     last = run_ / "checkpoints" / "last" / "pretrained_model"
     convert = [
@@ -82,14 +91,14 @@ def commands(geometry: str, size: str, scratch: Path) -> list[tuple[str, list[st
         (
             "train",
             [
-                train, f"--policy.path={policy}", "--policy.device=cpu", "--policy.push_to_hub=false",
+                train, f"--policy.path={policy}", f"--policy.device={device}", "--policy.push_to_hub=false",
                 "--policy.gradient_checkpointing=true", "--policy.lora_targets=expert", "--peft.r=8",
                 "--dataset.repo_id=local/data", f"--dataset.root={data}", f"--output_dir={run_}", "--steps=2", "--save_freq=2",
                 "--log_freq=1", "--batch_size=1", "--num_workers=0", "--wandb.enable=false",
             ],
         ),
         ("merge", [ours, "merge", str(last), str(merged)]),
-        ("chunk", [ours, "bench", str(merged), "--rounds", "1", f"--dataset.root={data}"]),
+        ("chunk", [ours, "bench", str(merged), "--rounds", "1", f"--dataset.root={data}", "--device", device]),
     ]  # fmt: skip
 
 
@@ -98,6 +107,8 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where to write; the system's temporary folder by default")
     parser.add_argument("--geometry", default="features", choices=["features", "da3", "rgbd"])
     parser.add_argument("--size", default="gemma_2b", choices=SIZES)
+    parser.add_argument("--data", type=Path, help="a LeRobotDataset with the simulated environment's features")
+    parser.add_argument("--device", default="cpu", help="of training and of the chunk")
     parser.add_argument("--output", type=Path, help="write the numbers to this JSON file")
     args = parser.parse_args()
     scratch = Path(tempfile.mkdtemp(prefix="warm_start_", dir=args.folder))
@@ -106,16 +117,20 @@ def main() -> None:
         write_source(scratch / "source", paligemma, expert, pixels)
         if args.geometry != "rgbd":
             write_encoder(scratch / "encoder", "base" if args.size == "gemma_2b" else "tiny")
-        record = [str(Path(sys.executable).parent / "pi05-geometry"), "record", "--episodes", "1"]
-        run("record", [*record, f"--output={scratch / 'data'}"], scratch / "log")
-        result = {
-            name: run(name, command, scratch / "log") for name, command in commands(args.geometry, args.size, scratch)
-        }
+        data = scratch / "data"
+        if args.data:
+            shutil.copytree(args.data, data)  # precompute adds features to it
+        else:
+            run("record", [program("pi05-geometry"), "record", "--episodes", "1", f"--output={data}"], scratch / "log")
+        steps = commands(args.geometry, args.size, scratch, data, args.device)
+        result = {name: run(name, command, scratch / "log") for name, command in steps}
         print((scratch / "log").read_text()[-1500:])
     finally:
         shutil.rmtree(scratch)
     if args.output:
-        args.output.write_text(json.dumps({"geometry": args.geometry, "size": args.size, **result}, indent=2))
+        args.output.write_text(
+            json.dumps({"geometry": args.geometry, "size": args.size, "device": args.device, **result}, indent=2)
+        )
 
 
 if __name__ == "__main__":
