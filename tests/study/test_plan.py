@@ -9,6 +9,7 @@ import pytest
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.study import adapted, simulated
 from lerobot_policy_pi05_geometry.study.adapted import AdaptedRun
+from lerobot_policy_pi05_geometry.study.conditions import DENOISING_STEPS
 from lerobot_policy_pi05_geometry.study.estimate import Costs, estimate
 from lerobot_policy_pi05_geometry.study.growth_report import write_growth_report
 from lerobot_policy_pi05_geometry.study.plan import phases, runs_of
@@ -164,7 +165,9 @@ def test_a_condition_of_denoising_steps_reaches_the_policy(arm, tmp_path, monkey
     loaded = SimpleNamespace(policy=SimpleNamespace(config=PI05GeometryConfig(device="cpu")))
     monkeypatch.setattr(simulated, "load_policy", lambda *_, **options: given.append(options) or loaded)
     run = next(run for run in runs_of(SPEC, tmp_path) if run.arm_name == arm)
-    for condition in ("inside", "steps-1", "steps-10"):
+    for condition in ("inside", "steps-3", "steps-10"):
         run.load(condition, None)
-    assert given == [{}, {"num_inference_steps": 1}, {"num_inference_steps": 10}]
-    assert len({run.outcome(condition) for condition in ("inside", "steps-1", "steps-10")}) == 3
+    assert given == [
+        {"num_inference_steps": steps} for steps in (DENOISING_STEPS, 3, 10)
+    ]  # whatever the checkpoint has
+    assert len({run.outcome(condition) for condition in ("inside", "steps-3", "steps-10")}) == 3

@@ -9,6 +9,7 @@ from lerobot_policy_pi05_geometry.sim.cameras import find_range
 from lerobot_policy_pi05_geometry.study.arms import ARMS
 from lerobot_policy_pi05_geometry.study.conditions import (
     CONDITIONS,
+    DENOISING_STEPS,
     azimuth_condition,
     azimuth_of,
     equivalent_condition,
@@ -148,7 +149,7 @@ def test_an_azimuth_is_a_condition():
 
 def test_a_number_of_denoising_steps_is_a_condition():
     assert find_condition("steps-3").denoising_steps == 3
-    assert find_condition("inside").denoising_steps is None
+    assert find_condition("inside").denoising_steps == DENOISING_STEPS
     for wrong in ("steps-0", "steps-", "steps--1", "steps-2.5", "steps-²"):
         with pytest.raises(ValueError, match="no condition 'steps-"):
             find_condition(wrong)
@@ -160,9 +161,12 @@ def test_any_condition_may_have_a_number_of_denoising_steps():
         assert few.denoising_steps == 3
         assert (few.cameras, few.sensor, few.changes) == (plain.cameras, plain.sensor, plain.changes)
     rgb, geometry = ARMS["rgb"], ARMS["geometry"]
-    assert equivalent_condition("depth-off-steps-1", geometry) == "depth-off-steps-1"
-    assert equivalent_condition("depth-off-steps-1", rgb) == "steps-1"  # a file of its own would be evaluated twice
-    assert equivalent_condition("inside-steps-1", geometry) == "steps-1"
+    # One name for one evaluation, or it would be run twice.
+    assert equivalent_condition("depth-off-steps-3", geometry) == "depth-off-steps-3"
+    assert equivalent_condition("depth-off-steps-3", rgb) == "steps-3"
+    assert equivalent_condition("inside-steps-3", geometry) == "steps-3"
+    assert equivalent_condition(f"outside-steps-{DENOISING_STEPS}", geometry) == "outside"
+    assert equivalent_condition(f"steps-{DENOISING_STEPS}", geometry) == "inside"
     assert sorted(["outside-steps-1", "steps-3", "outside", "inside"], key=order_of) == [
         "inside",
         "steps-3",

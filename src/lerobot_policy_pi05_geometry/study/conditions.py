@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from ..sim.cameras import azimuth_range, find_range
 from .arms import DEPTH, POSE, Arm
 
+DENOISING_STEPS = 1  # of a chunk, unless a condition says otherwise: more are worse in these tasks (docs/results.md)
 _AZIMUTH = "azimuth"
 _STEPS = re.compile(r"(?:(?P<condition>.+)-)?steps-(?P<count>[1-9][0-9]*)")
 
@@ -15,14 +16,14 @@ class Condition:
     """One condition. cameras: range of camera poses (sim/cameras.py). sensor: depth sensor (sim/sensor.py).
 
     changes: what the sensor's fault changes, depth or the camera's pose; None for an ideal sensor.
-    denoising_steps: of a chunk; None: the checkpoint's own.
+    denoising_steps: of a chunk.
     """
 
     title: str
     cameras: str = "train"
     sensor: str = "ideal"
     changes: str | None = None
-    denoising_steps: int | None = None
+    denoising_steps: int = DENOISING_STEPS
 
 
 CONDITIONS = {
@@ -54,8 +55,10 @@ def split_steps(name: str) -> tuple[str, int | None]:
 
 
 def _join_steps(condition: str, count: int | None) -> str:
-    """The inverse of `split_steps`."""
-    return condition if count is None else f"steps-{count}" if condition == "inside" else f"{condition}-steps-{count}"
+    """The shortest name that `split_steps` reads so."""
+    if count in (None, DENOISING_STEPS):
+        return condition
+    return f"steps-{count}" if condition == "inside" else f"{condition}-steps-{count}"
 
 
 def order_of(name: str) -> tuple[int, int]:

@@ -18,13 +18,14 @@ from ..sim.configuration import MetaworldRgbdEnv
 from ..sim.environment import FPS
 from ..sim.evaluate import evaluate
 from .adapted import AdaptedRun
+from .conditions import DENOISING_STEPS
 from .frames_in_memory import FramesInMemory
 from .plan import runs_of, sweep_runs
 from .pretraining import PretrainingRun, pretraining_run
 from .recordings import Recording
 from .simulated import SimulatedRun
 from .spec import Budget, StudySpec
-from .training_options import ACTION_DIM, INFERENCE_STEPS
+from .training_options import ACTION_DIM
 
 _RECORDED, _TRAINED = 2, 3  # episodes and steps of the measurement
 
@@ -115,7 +116,7 @@ def _new_policy(budget: Budget, recording: Recording) -> LoadedPolicy:
         chunk_size=budget.chunk_size,
         n_action_steps=budget.action_steps,
         max_action_dim=ACTION_DIM,
-        num_inference_steps=INFERENCE_STEPS,
+        num_inference_steps=DENOISING_STEPS,
         flow_samples=budget.flow_samples,
         device=budget.device,
         push_to_hub=False,

@@ -81,12 +81,11 @@ class SimulatedRun(Run):
 
     def evaluation_description(self, condition: str) -> dict[str, Any]:
         about = find_condition(condition)
-        steps = {} if about.denoising_steps is None else {"denoising_steps": about.denoising_steps}
         return {
             "cameras": asdict(find_range(about.cameras)),
             "sensor": asdict(SENSORS[about.sensor]),
             "budget": {name: getattr(self.budget, name) for name in EVALUATION},
-            **steps,
+            "denoising_steps": about.denoising_steps,
         }
 
     def distinct_conditions(self) -> list[str]:
@@ -122,8 +121,7 @@ class SimulatedRun(Run):
     def load(self, condition: str, environment: MetaworldRgbdEnv) -> LoadedPolicy:
         """The policy to evaluate under a condition."""
         steps = find_condition(condition).denoising_steps
-        options = {} if steps is None else {"num_inference_steps": steps}
-        return load_policy(self.checkpoint, self.budget.device, environment, **options)
+        return load_policy(self.checkpoint, self.budget.device, environment, num_inference_steps=steps)
 
     def evaluate(self, condition: str, report_progress: ReportProgress) -> None:
         about, budget = find_condition(condition), self.budget

@@ -3,9 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+from .conditions import DENOISING_STEPS
 from .spec import Budget
 
-ACTION_DIM, INFERENCE_STEPS, WARMUP_STEPS = 4, 5, 50
+ACTION_DIM, WARMUP_STEPS = 4, 50
 
 
 def network_options(budget: Budget) -> dict[str, Any]:
@@ -26,7 +27,7 @@ def training_options(budget: Budget, steps: int, learning_rate: float, seed: int
         "policy.device": budget.device,
         "policy.push_to_hub": "false",
         "policy.n_action_steps": budget.action_steps,
-        "policy.num_inference_steps": INFERENCE_STEPS,
+        "policy.num_inference_steps": DENOISING_STEPS,
         "policy.flow_samples": budget.flow_samples,
         "policy.optimizer_lr": learning_rate,
         "policy.scheduler_decay_lr": learning_rate / 20,
