@@ -33,8 +33,26 @@ def test_a_task_that_there_is_not(tmp_path):
     assert "There is no simulated task 'fly'" in fail("record", "--output", str(tmp_path / "data"), "--task", "fly")
 
 
-def test_a_dataset_that_is_none(tmp_path):
-    assert "is no LeRobotDataset" in fail("inspect", str(tmp_path), f"--dataset.root={tmp_path}")
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["inspect", "checkpoint"],
+        ["bench", "checkpoint"],
+        ["scene", "--file", "arm.json"],
+        ["calibrate", "camera", "--file", "arm.json", "--camera", "front"],
+        ["calibrate", "arm", "--file", "arm.json", "--model", "arm.urdf"],
+        ["precompute", "--encoder", "encoder"],
+        ["quantiles"],
+    ],
+    ids=lambda arguments: " ".join(arguments[:2]),
+)
+def test_a_folder_without_a_dataset(arguments, tmp_path, monkeypatch):
+    """One sentence, and no look at the hub, where LeRobot would search for it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lerobot.datasets.dataset_metadata.LeRobotDatasetMetadata.__init__", None)
+    result = CliRunner().invoke(app, [*arguments, f"--dataset.root={tmp_path / 'data'}"])
+    assert isinstance(result.exception, FileNotFoundError), result.output
+    assert "holds no LeRobotDataset (meta/info.json is missing)" in str(result.exception)
 
 
 def test_a_conversion_that_fails_leaves_nothing(tmp_path):

@@ -17,7 +17,7 @@ SRC = Path(package.__file__).parent
 ROOT = SRC.parents[1]
 # From the bottom up; a module may import from its own layer and from the layers before it.
 LAYERS = [
-    {"model", "weight_files", "compat"},
+    {"model", "weight_files", "dataset_folder", "compat"},
     {"inference", "geometry", "data", "training"},
     {"configuration_pi05_geometry", "configuration_checks"},
     {"processor_pi05_geometry"},

@@ -117,6 +117,7 @@ def arm(
 
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    from lerobot_policy_pi05_geometry.dataset_folder import require_dataset
     from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
     from lerobot_policy_pi05_geometry.robot.calibrate import make_arm, state_names
     from lerobot_policy_pi05_geometry.robot.link_files import read_links
@@ -125,7 +126,7 @@ def arm(
     if any(not sign or not entry for _, sign, entry in pairs):
         raise ValueError("--joint is written JOINT=STATE_ENTRY, as elbow=elbow_flex.pos.")
     calibration = _read(file)
-    names = state_names(LeRobotDataset(dataset_repo_id, root=dataset_root))
+    names = state_names(LeRobotDataset(dataset_repo_id, root=require_dataset(dataset_root)))
     made = make_arm(read_links(model, base), names, {left: right for left, _, right in pairs}, unit)
     known = [each.joint for each in made.joints]
     if set(flip or []) - set(known):
@@ -161,6 +162,7 @@ def hand_eye(
     import numpy as np
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    from lerobot_policy_pi05_geometry.dataset_folder import require_dataset
     from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
     from lerobot_policy_pi05_geometry.inspect.inspection import frame_batch
     from lerobot_policy_pi05_geometry.inspect.scene import scene_figure, scene_of
@@ -171,7 +173,9 @@ def hand_eye(
         dataset_root, dataset_repo_id, _read(file), camera, arm, link, Board.parse(board), not fixed
     )
     write_calibration_file(file, changed)
-    scene = scene_of(frame_batch(LeRobotDataset(dataset_repo_id, root=dataset_root), found.views[0]), changed)
+    scene = scene_of(
+        frame_batch(LeRobotDataset(dataset_repo_id, root=require_dataset(dataset_root)), found.views[0]), changed
+    )
     scene_figure(scene).savefig(picture, dpi=130)
     console.print(f"{len(found.views)} views. Board in the image and as predicted from the reported joints:")
     for title, residuals in (("  all views", found.fitted), ("  held out", found.held_out)):
@@ -206,9 +210,12 @@ def depth(
     """Check a camera's depth against the arm in its view: more than 10 % off is an error."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    from lerobot_policy_pi05_geometry.dataset_folder import require_dataset
     from lerobot_policy_pi05_geometry.robot.link_depth import check_link_depth
 
-    found = check_link_depth(LeRobotDataset(dataset_repo_id, root=dataset_root), _read(file), camera, arm, model)
+    found = check_link_depth(
+        LeRobotDataset(dataset_repo_id, root=require_dataset(dataset_root)), _read(file), camera, arm, model
+    )
     console.print(
         f"{camera}: measured depth of the arm is {found.ratio:.3f} times what its links say (median of {found.pixels} pixels in "
         f"{found.frames} frames)."
@@ -231,6 +238,7 @@ def scene(
     """What a calibration says: the points of all depth cameras in the base frame, with the arm's links drawn into them."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    from lerobot_policy_pi05_geometry.dataset_folder import require_dataset
     from lerobot_policy_pi05_geometry.geometry.calibration import read_calibration_file
     from lerobot_policy_pi05_geometry.geometry.dataset_calibration import read_dataset_calibration
     from lerobot_policy_pi05_geometry.geometry.dataset_depth import codec_bounds
@@ -238,7 +246,7 @@ def scene(
     from lerobot_policy_pi05_geometry.inspect.inspection import frame_batch
     from lerobot_policy_pi05_geometry.inspect.scene import log_to_rerun, scene_figure, scene_of
 
-    dataset = LeRobotDataset(dataset_repo_id, root=dataset_root)
+    dataset = LeRobotDataset(dataset_repo_id, root=require_dataset(dataset_root))
     features = dataset.meta.features
     depth_keys = find_depth_keys(features, {})
     calibration = read_dataset_calibration(dataset.meta, depth_keys) if file is None else read_calibration_file(file)

@@ -43,10 +43,13 @@ def bench(
     from rich.table import Table
 
     from lerobot_policy_pi05_geometry.checkpoint.load import load_policy
+    from lerobot_policy_pi05_geometry.dataset_folder import require_dataset
     from lerobot_policy_pi05_geometry.inspect.bench import bench as run
     from lerobot_policy_pi05_geometry.inspect.bench import random_observation
     from lerobot_policy_pi05_geometry.inspect.inspection import frame_batch
 
+    if dataset_root is not None:
+        require_dataset(dataset_root)
     loaded = load_policy(checkpoint, device)
     if dataset_root is None:
         observation = random_observation(loaded.policy.config)

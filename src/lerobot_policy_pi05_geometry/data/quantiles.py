@@ -16,6 +16,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 from pyarrow import dataset as tables
 
+from ..dataset_folder import require_dataset
+
 WIDE_ENOUGH = 0.5  # share of min..max that q01..q99 covers, below which check_stats warns
 _LOW, _HIGH = ("q01", "q10"), ("q90", "q99")
 
@@ -35,9 +37,7 @@ def write_frame_quantiles(
     and `keys` names actions, or `full_range` names what is not there.
     """
     root = Path(root)
-    if not (root / "meta" / "info.json").is_file():
-        raise FileNotFoundError(f"{root} holds no LeRobotDataset (meta/info.json is missing).")
-    meta = LeRobotDatasetMetadata(repo_id, root=root)
+    meta = LeRobotDatasetMetadata(repo_id, root=require_dataset(root))
     if ACTION in keys and action_kind(meta) == "relative":
         raise ValueError(
             f"The action statistics of {root} are of relative actions (use_relative_actions), computed over whole chunks; "

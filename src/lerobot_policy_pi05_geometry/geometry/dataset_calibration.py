@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..dataset_folder import INFO_FILE, require_dataset
 from ..weight_files.files import write_whole
 from .calibration import (
     BASE_FRAME,
@@ -35,7 +36,6 @@ from .keys import RIG, camera_of, depth_camera_name, depth_features, is_depth_ke
 INFO_ENTRY = "calibration"
 ARMS_ENTRY, RIGS_ENTRY = "arms", "rigs"
 _STATE = "observation.state"
-_INFO_FILE = Path("meta") / "info.json"
 
 
 def read_dataset_calibration(dataset_meta: Any, depth_keys: Mapping[str, str]) -> Calibration:
@@ -56,19 +56,19 @@ def read_dataset_calibration(dataset_meta: Any, depth_keys: Mapping[str, str]) -
     else:
         content["cameras"] = entries
         content["arms"] = (features.get(_STATE, {}).get("info") or {}).get(ARMS_ENTRY, {})
-    in_info = parse_calibration(content, f"The calibration in {root / _INFO_FILE}")
+    in_info = parse_calibration(content, f"The calibration in {root / INFO_FILE}")
     file = root / "meta" / CALIBRATION_FILE
     in_file = read_calibration_file(file) if file.is_file() else Calibration()
     for camera in in_info.cameras.keys() & in_file.cameras.keys():
         if in_info.cameras[camera] != in_file.cameras[camera]:
             raise ValueError(
-                f"Camera '{camera}' has two calibrations that differ, in {root / _INFO_FILE} (feature {keys[camera]}) and in "
+                f"Camera '{camera}' has two calibrations that differ, in {root / INFO_FILE} (feature {keys[camera]}) and in "
                 f"{file}; delete the wrong one, or give the right one with --policy.calibration_path."
             )
     for name in in_info.arms.keys() & in_file.arms.keys():
         if in_info.arms[name] != in_file.arms[name]:
             raise ValueError(
-                f"Arm '{name}' has two calibrations that differ, in {root / _INFO_FILE} and in {file}; delete the wrong one, or "
+                f"Arm '{name}' has two calibrations that differ, in {root / INFO_FILE} and in {file}; delete the wrong one, or "
                 "give the right one with --policy.calibration_path."
             )
     return Calibration(in_file.cameras | in_info.cameras, in_file.arms | in_info.arms, in_file.rigs | in_info.rigs)
@@ -80,9 +80,7 @@ def write_dataset_calibration(root: Path, rig: Rig, depth_keys: Mapping[str, str
     depth_keys: as in `read_dataset_calibration`. Raises ValueError for a camera that the
     dataset does not have, FileNotFoundError if there is no dataset at `root`.
     """
-    path = root / _INFO_FILE
-    if not path.is_file():
-        raise FileNotFoundError(f"{root} holds no LeRobotDataset (meta/info.json is missing).")
+    path = require_dataset(root) / INFO_FILE
     info = json.loads(path.read_text())
     if isinstance(rig, Calibration) and rig.rigs:
         if RIG not in info["features"]:

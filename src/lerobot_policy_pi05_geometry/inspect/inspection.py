@@ -7,6 +7,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from ..checkpoint.load import load_policy
 from ..configuration_pi05_geometry import PI05GeometryConfig
+from ..dataset_folder import require_dataset
 from ..geometry.calibration import Calibration
 from .page import Page, picture
 from .pictures import depth_figure, layout_figure, segment_share_figure
@@ -20,10 +21,7 @@ def write_inspection(
 
     Raises ValueError for a frame outside the dataset or a checkpoint of another policy.
     """
-    if not (root / "meta" / "info.json").is_file():
-        raise FileNotFoundError(
-            f"{root} is no LeRobotDataset: it has no meta/info.json; give the dataset's folder with --dataset.root."
-        )
+    require_dataset(root)
     loaded = load_policy(checkpoint, device)
     policy = loaded.policy
     dataset = LeRobotDataset(repo_id, root=root, depth_output_unit=policy.config.depth_unit)

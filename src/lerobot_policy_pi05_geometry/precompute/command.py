@@ -9,6 +9,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from rich.markup import escape
 from rich.progress import Progress
 
+from ..dataset_folder import require_dataset
 from .run import Precompute, begin, disk_needed, free_bytes, prepare, verify
 
 
@@ -28,8 +29,8 @@ def run_precompute(
     bars: Progress,
 ) -> None:
     """Compute this process's share of a store, under torchrun or alone. The parameters are the command's options."""
-    if root is not None and not (root / "meta" / "info.json").is_file():
-        raise FileNotFoundError(f"{root} holds no LeRobotDataset (meta/info.json is missing).")
+    if root is not None:
+        require_dataset(root)
     rank, world_size = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
     dataset = LeRobotDataset(repo_id, root=root, return_uint8=True)
     work = prepare(dataset, encoder, grid, cameras, image_size, dtype, output, shard_frames)

@@ -9,6 +9,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 
+from ..dataset_folder import require_dataset
 from ..geometry.calibration import Calibration
 from ..geometry.camera import CameraCalibration, Mount, pose_of_sensor
 from ..geometry.depth import LEROBOT_COUNT
@@ -81,7 +82,7 @@ def calibrate_hand_eye(
     if arm_name not in calibration.arms:
         raise ValueError(f"The calibration has no arm '{arm_name}'; write it first with `pi05-geometry calibrate arm`.")
     arm, of_camera = calibration.arms[arm_name], calibration.cameras[camera]
-    dataset = LeRobotDataset(repo_id, root=root)
+    dataset = LeRobotDataset(repo_id, root=require_dataset(root))
     names = state_names(dataset)
     for joint in arm.joints:
         if joint.index >= len(names) or names[joint.index] != joint.state:

@@ -9,6 +9,7 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import OBS_IMAGES
 
+from ..dataset_folder import require_dataset
 from ..geometry.camera import CameraCalibration, ColorStream
 from ..geometry.rigid import identity_rows
 from .board import Board, Detection
@@ -47,7 +48,7 @@ def read_intrinsics(root: Path, repo_id: str, camera: str, board: Board) -> Intr
 
     Raises ValueError with one sentence for a camera that is not there, and for views from which nothing follows.
     """
-    dataset = LeRobotDataset(repo_id, root=root)
+    dataset = LeRobotDataset(repo_id, root=require_dataset(root))
     key = f"{OBS_IMAGES}.{camera}"
     if key not in dataset.meta.camera_keys:
         known = ", ".join(dataset.meta.camera_keys) or "no camera"

@@ -15,6 +15,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_tools import add_features, merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from ..dataset_folder import require_dataset
 from ..geometry.calibration import Calibration, Rig
 from ..geometry.dataset_calibration import (
     ARMS_ENTRY,
@@ -72,9 +73,7 @@ def labelled(dataset: LeRobotDataset, number: int, calibration: Calibration, out
 
 
 def _read(root: Path) -> LeRobotDatasetMetadata:
-    if not (root / "meta" / "info.json").is_file():
-        raise FileNotFoundError(f"{root} holds no LeRobotDataset (meta/info.json is missing).")
-    return LeRobotDatasetMetadata(f"local/{root.name}", root=root)
+    return LeRobotDatasetMetadata(f"local/{root.name}", root=require_dataset(root))
 
 
 def _rig_of(meta: LeRobotDatasetMetadata) -> Rig:

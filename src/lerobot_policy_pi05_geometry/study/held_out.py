@@ -22,6 +22,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch.utils.data import default_collate
 
 from ..checkpoint.load import LoadedPolicy, load_policy
+from ..dataset_folder import require_dataset
 from ..geometry.keys import DEPTH_SUFFIX, depth_features, find_depth_key, is_depth_key
 from .arms import DEPTH, find_arm
 from .runs import ReportProgress, Run, option_list, versions
@@ -176,8 +177,7 @@ def held_out_runs(
 
     Raises FileNotFoundError if there is no dataset, and ValueError if arms or settings do not fit it.
     """
-    if not (dataset_root / "meta" / "info.json").is_file():
-        raise FileNotFoundError(f"{dataset_root} holds no LeRobotDataset (meta/info.json is missing).")
+    require_dataset(dataset_root)
     if not 0 < held_out < 1:
         raise ValueError(f"The share of held-out episodes must be between 0 and 1, got {held_out}.")
     for name in arms:

@@ -9,6 +9,8 @@ import numpy as np
 import pyarrow
 from pyarrow import compute, parquet
 
+from ...dataset_folder import require_dataset
+
 # Statistics of columns that say where an episode stands in the dataset, and not what is in it.
 _PLACES = ("index", "episode_index", "frame_index", "task_index", "timestamp")
 _LENGTH, _EPISODE, _STATISTICS = "length", "episode_index", "stats/"
@@ -34,8 +36,7 @@ def read_episodes(root: Path) -> Episodes:
     files are left out, and so is everything else in `meta/`: features do not depend on them.
     Raises FileNotFoundError if there is no dataset at `root`, ValueError for a table without episodes.
     """
-    if not (root / "meta" / "info.json").is_file():
-        raise FileNotFoundError(f"{root} holds no LeRobotDataset (meta/info.json is missing).")
+    require_dataset(root)
     found: dict[int, tuple[int, str]] = {}
     for path in sorted((root / "meta" / "episodes").rglob("*.parquet")):
         names = parquet.read_schema(path).names
