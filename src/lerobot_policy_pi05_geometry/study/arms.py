@@ -41,7 +41,12 @@ ARMS = {
     "blind": Arm("no camera: the blind floor", {**_NO_GEOMETRY, "policy.input_features": BLIND_INPUTS}),
     "rgb": Arm("RGB only: plain π0.5", _NO_GEOMETRY),
     "rgb-wide": Arm("RGB only, trained on the wide camera range", _NO_GEOMETRY, cameras="wide"),
-    "rgb+rays": Arm("RGB, and camera rays without depth", {"policy.geometry_source": "rays"}, reads=frozenset({POSE})),
+    # Rays alone show nothing of the scene, so samples without images would only be lost.
+    "rgb+rays": Arm(
+        "RGB, and camera rays without depth",
+        {"policy.geometry_source": "rays", "policy.image_dropout": "0", "policy.geometry_dropout": "0"},
+        reads=frozenset({POSE}),
+    ),
     "rgb+modulation": Arm(
         "RGB only, its visual tokens adapted to each condition with one demonstration", _NO_GEOMETRY, adapts="rgb"
     ),
