@@ -184,7 +184,7 @@ def kept(policy: PI05GeometryPolicy, optimizer: torch.optim.Optimizer | None) ->
     tables = [
         moment.qmap for values in optimizer.state.values() for moment in values.values() if hasattr(moment, "qmap")
     ]
-    return [*state, *tables, *policy.update_size.previous]
+    return [*state, *tables, *policy.geometry_log.update_size.previous]
 
 
 def main() -> None:

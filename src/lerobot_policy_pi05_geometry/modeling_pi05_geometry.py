@@ -11,7 +11,6 @@
 import logging
 import math
 from collections import deque
-from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -48,11 +47,11 @@ from .model import PI05Pytorch
 from .model.config import RunnerName
 from .model.flow_matching import FlowDraw, draw_flow
 from .model.segments import GeometryTokens
-from .training.attention_share import AttentionShare
 from .training.dropout import Cameras, drop
+from .training.geometry_log import GeometryLog
 from .training.lora import always_in_full, peft_targets
-from .training.micro_batches import each_of, rows_of, sum_of
-from .training.parameter_groups import UpdateSize, new_parameters, parameter_groups
+from .training.micro_batches import in_micro_batches, rows_of
+from .training.parameter_groups import new_parameters, parameter_groups
 from .training.progress import TrainingProgress
 from .training.sharding import UNIT_CLASSES, require_whole_parameters
 from .weight_files.files import find_file, require_policy_type
@@ -60,7 +59,6 @@ from .weight_files.strict_load import load_strictly
 
 logger = logging.getLogger(__name__)
 
-_SHARE_EVERY = 20  # training steps between two measurements of the attention that actions give to geometry
 _EVALUATION_STEP = -1  # The evaluation loss draws the same noise at every training step, so that values are comparable.
 
 
@@ -109,8 +107,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self.progress = TrainingProgress()
         self._acted_on = 0  # rows of the last observation; 0 before the first
         self._noise_seed = torch.initial_seed()
-        self.update_size = UpdateSize()
-        self._last_share: Tensor | None = None
+        tokens = 0 if self.geometry is None else self.geometry.source.num_tokens
+        self.geometry_log = GeometryLog(self.model.paligemma_with_expert, tokens)
         self.image_range = ImageRangeCheck()
         if not self.model.action_in_proj.weight.is_meta:  # Meta tensors get their values in from_pretrained.
             warn_of_random_weights(config)
@@ -233,49 +231,16 @@ class PI05GeometryPolicy(PreTrainedPolicy):
                 return losses.sum(dim=(1, 2)) / (valid[rows].sum(dim=1).clamp_min(1) * action_dim)
             return losses.sum() / (count * action_dim)
 
-        share = self._attention_share()
-        with nullcontext() if share is None else share.measuring():
-            loss = self._in_micro_batches(part, size, reduction)
-        if share is not None:
-            self._last_share = share.mean()
+        rows_at_once = self.config.micro_batch_size or size
+        with self.geometry_log.measuring(int(self.training_step)) if self.training else nullcontext():
+            loss = in_micro_batches(part, size, rows_at_once, self, reduction)
         losses = torch.cat(seen)  # (B, S, action_dim)
         info: dict[str, Any] = {"loss": (losses.sum() / (count * action_dim)).item()}
         if not math.isfinite(info["loss"]):
             require_finite_losses(losses, batch)
         info["loss_per_dim"] = (losses.sum(dim=(0, 1)) / count).tolist()
-        info.update(self._geometry_info())
+        info.update(self.geometry_log.numbers())
         return loss, info
-
-    def _geometry_info(self) -> dict[str, float]:
-        """Whether geometry is taken up, in percent: LeRobot logs three digits behind the point."""
-        gate = self.model.paligemma_with_expert.geometry_gate
-        found = self.update_size.to_log()
-        if gate is not None:
-            found["gate_openness_pct"] = gate.mean_openness()
-        if self._last_share is not None:
-            found["geometry_attention_pct"] = self._last_share
-        return {name: 100 * value.item() for name, value in found.items()}
-
-    def _attention_share(self) -> AttentionShare | None:
-        """What measures the attention that actions give to geometry, in some of the training steps."""
-        network = self.model.paligemma_with_expert
-        if not self.training or self.geometry is None or network.geometry_gate is None:
-            return None
-        now = int(self.training_step) % _SHARE_EVERY == 0
-        return AttentionShare(network, self.geometry.source.num_tokens) if now else None
-
-    def _in_micro_batches(self, part: Callable[[slice], Tensor], size: int, reduction: str) -> Tensor:
-        """`part` of `micro_batch_size` rows at a time: the sum of its scalars, or its (b,) joined to (B,)."""
-        step = self.config.micro_batch_size or size
-        parts = [partial(part, slice(start, start + step)) for start in range(0, size, step)]
-        if len(parts) == 1:
-            return parts[0]()
-        parameters = [p for p in self.parameters() if p.requires_grad]
-        if torch.is_grad_enabled() and parameters:
-            require_whole_parameters(self, "micro_batch_size")
-            return (each_of if reduction == "none" else sum_of)(parts, parameters)
-        losses = [run() for run in parts]
-        return torch.cat(losses) if reduction == "none" else torch.stack(losses).sum()
 
     def _losses(self, batch: dict[str, Any], draw: FlowDraw) -> Tensor:
         """Loss of every action entry (B, S, max_action_dim), the mean over flow samples."""
@@ -335,7 +300,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def update(self) -> None:
         """Count an optimiser step, and measure how far the new parameters moved. LeRobot calls this after every step."""
         self.training_step.add_(1)
-        self.update_size.measure([p for p in self.new_parameters().values() if p.requires_grad])
+        self.geometry_log.moved([p for p in self.new_parameters().values() if p.requires_grad])
 
     # --- acting ---------------------------------------------------------------------------------------------------
 

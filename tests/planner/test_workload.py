@@ -57,7 +57,9 @@ def trained(policy: PI05GeometryPolicy, batch: dict) -> int:
         policy.update()
 
     step()
-    before = storage_bytes([*policy.parameters(), *policy.buffers(), *batch.values(), *policy.update_size.previous])
+    before = storage_bytes(
+        [*policy.parameters(), *policy.buffers(), *batch.values(), *policy.geometry_log.update_size.previous]
+    )
     return before + sum(state_bytes(optimizer)) + allocated(step)
 
 

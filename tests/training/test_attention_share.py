@@ -72,7 +72,7 @@ def test_it_is_measured_now_and_then_and_changes_nothing() -> None:
     policy.model.paligemma_with_expert.geometry_gate.openness.data.fill_(5.0)
     assert policy.forward(batch)[1]["geometry_attention_pct"] == info["geometry_attention_pct"]
     other = make_policy().train()
-    other._attention_share = lambda: None
+    other.geometry_log._tokens = 0
     assert torch.equal(other.forward(batch)[0], loss)
 
 

@@ -10,6 +10,7 @@ once more in the backward pass.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,8 +18,24 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from ..geometry.keys import CALIBRATION_PREFIX
+from .sharding import require_whole_parameters
 
 Part = Callable[[], Tensor]  # computes the loss of one micro-batch, with its graph
+
+
+def in_micro_batches(
+    part: Callable[[slice], Tensor], size: int, step: int, policy: nn.Module, reduction: str
+) -> Tensor:
+    """`part` of `step` rows of `size` at a time: the sum of its scalars, or, with reduction "none", its (b,) joined to (B,)."""
+    parts: list[Part] = [partial(part, slice(start, start + step)) for start in range(0, size, step)]
+    if len(parts) == 1:
+        return parts[0]()
+    parameters = [p for p in policy.parameters() if p.requires_grad]
+    if torch.is_grad_enabled() and parameters:
+        require_whole_parameters(policy, "micro_batch_size")
+        return (each_of if reduction == "none" else sum_of)(parts, parameters)
+    losses = [run() for run in parts]
+    return torch.cat(losses) if reduction == "none" else torch.stack(losses).sum()
 
 
 def sum_of(parts: Sequence[Part], parameters: Sequence[nn.Parameter]) -> Tensor:
