@@ -41,7 +41,8 @@ def start_with(source: str, encoder: Path, calibration: Path, **changes) -> Geom
         "random": {"cameras": ("front", "wrist")},
         "none": {},
     }.get(source, {"encoder": str(encoder)})
-    return GeometryStart(source, **{"grid": 3, **settings, **changes})
+    grid = {} if source == "none" else {"grid": 3}
+    return GeometryStart(source, **{**grid, **settings, **changes})
 
 
 def lerobot_features() -> dict:
@@ -152,6 +153,8 @@ def test_the_data_names_the_cameras_that_depth_anything_looks_through(
         (GeometryStart("rgbd", encoder="somewhere"), "--da3-encoder belongs to --geometry-source=da3 or features"),
         (GeometryStart("da3", encoder="/nowhere"), "The Depth Anything 3 encoder is not found"),
         (GeometryStart("random", calibration=Path("x")), "--calibration has no meaning"),
+        (GeometryStart("none", grid=4, openness=1.0), "--geometry-grid, --geometry-gate-openness has no meaning"),
+        (GeometryStart("none", cameras=("front",)), "--geometry-cameras has no meaning"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

@@ -183,15 +183,17 @@ def test_what_belongs_to_the_source_alone_does_not_carry_over(tmp_path, caplog):
     assert policy.config.may_be_absent("observation.images.empty_camera_0")
 
 
-@pytest.mark.parametrize("geometry", ["none", "random", "rgbd"])
+@pytest.mark.parametrize("geometry", ["random", "rgbd"])
 @pytest.mark.parametrize("cameras", [None, ("front", "wrist", "third")])
 def test_it_loads_before_any_data_named_its_cameras(geometry, cameras, lerobot_source, tmp_path):
     convert(lerobot_source, tmp_path / "output", GeometryStart(source=geometry, cameras=cameras, grid=2))
     policy = PI05GeometryPolicy.from_pretrained(tmp_path / "output")
-    if geometry == "none":
-        assert policy.geometry is None
-    else:
-        assert policy.geometry.source.num_tokens == 4 * len(cameras or [""])
+    assert policy.geometry.source.num_tokens == 4 * len(cameras or [""])
+
+
+def test_it_loads_without_geometry(lerobot_source, tmp_path):
+    convert(lerobot_source, tmp_path / "output", GeometryStart(source="none"))
+    assert PI05GeometryPolicy.from_pretrained(tmp_path / "output").geometry is None
 
 
 def test_an_own_expert_starts_as_the_action_expert(lerobot_source, tmp_path):

@@ -50,6 +50,20 @@ class GeometryStart:
             )
         if self.calibration is not None and source in ("random", "none"):
             raise ValueError(f"--calibration has no meaning with --geometry-source={source}; leave it out.")
+        if source == "none" and (without_effect := [f"--geometry-{name}" for name in self._of_geometry()]):
+            raise ValueError(f"{', '.join(without_effect)} has no meaning with --geometry-source=none; leave it out.")
+
+    def _of_geometry(self) -> list[str]:
+        """Names of the options given that say something of geometry, as the command has them."""
+        given = {
+            "cameras": self.cameras,
+            "grid": self.grid,
+            "frame": self.frame,
+            "expert": self.expert,
+            "tokens": self.tokens,
+            "gate-openness": self.openness,
+        }
+        return [name for name, value in given.items() if value is not None]
 
     def settings(self, has_images: bool) -> dict[str, Any]:
         """Fields of the configuration of a π0.5 that gets this geometry. has_images: whether its cameras are known.
