@@ -61,3 +61,10 @@ def test_advice_follows_from_the_measurement():
 def test_no_round_is_no_measurement():
     with pytest.raises(ValueError, match="rounds must be at least 1, got 0"):
         bench(load(), make_observation(1), rounds=0)
+
+
+def test_no_observation_is_made_up_for_a_checkpoint_without_features():
+    config = load().policy.config
+    config.input_features = {}
+    with pytest.raises(ValueError, match=r"names no cameras and no state yet .* give --dataset.root"):
+        random_observation(config)

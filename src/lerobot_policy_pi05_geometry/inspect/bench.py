@@ -48,7 +48,15 @@ class BenchResult:
 
 
 def random_observation(config: PI05GeometryConfig, task: str = "do the task") -> dict[str, Any]:
-    """An observation of one sample with the shapes that a checkpoint expects: noise for images, depth 1 m at every pixel."""
+    """An observation of one sample with the shapes that a checkpoint expects: noise for images, depth 1 m at every pixel.
+
+    Raises ValueError for a checkpoint whose cameras come from the data that it will be trained on.
+    """
+    if not config.input_features:
+        raise ValueError(
+            "This checkpoint names no cameras and no state yet (the data that it is trained on will), so no observation can be "
+            "made up for it; give --dataset.root, or train it first."
+        )
     random = torch.Generator().manual_seed(0)
     observation: dict[str, Any] = {"task": [task]}
     for key, feature in {**(config.input_features or {}), **config.geometry_features}.items():
