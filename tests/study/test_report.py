@@ -64,7 +64,8 @@ def test_without_the_outside_condition_the_best_cell_is_named():
 
 
 def test_every_condition_has_its_place_in_a_report():
-    """Conditions with a name of their own first, then numbers of denoising steps, fewest first."""
-    given = ["steps-10", "noise", "steps-2", "inside"]
+    """Conditions in the order of their list, each with its numbers of denoising steps, fewest first."""
+    given = ["outside-steps-3", "steps-10", "noise", "steps-2", "outside", "inside"]
     rows = pd.concat([table({("t", "geometry"): 5}, condition) for condition in given])
-    assert [cell.condition for cell in cells(rows)] == ["inside", "noise", "steps-2", "steps-10"]
+    expected = ["inside", "steps-2", "steps-10", "outside", "outside-steps-3", "noise"]
+    assert [cell.condition for cell in cells(rows)] == expected
