@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from .app import Output, app, console, progress_bars, require_simulator
+from .app import Output, app, console, progress_bars
 
 if TYPE_CHECKING:
     from lerobot_policy_pi05_geometry.study.launch import Progress as StudyProgress
@@ -38,7 +38,8 @@ def study(
     spec: Annotated[
         str,
         typer.Option(
-            help="A study's TOML file, or the name of one: warm-start, warm-start-short, few-steps, default, longer, demo, smoke."
+            help="A study's TOML file, or the name of one: warm-start, warm-start-short, few-steps, default, longer, "
+            "augmentation, libero-pilot, demo, smoke."
         ),
     ] = "default",
     output: Output = Path("study"),
@@ -74,7 +75,6 @@ def study(
             )
         name = {"warm-start": "warm-start-smoke"}.get(spec, "smoke") if smoke else spec
         if estimate:
-            require_simulator()
             _print_estimate(name, output)
             return
         command = f"pi05-geometry study --spec {name} --output {output}"
@@ -113,16 +113,19 @@ def _forwarded(arguments: list[str]) -> dict[str, str]:
 
 def _simulated_study(name: str, output: Path, workers: int | None, retry_crashed: bool, command: str) -> Path | None:
     """Execute this rank's share of a simulated study, phase by phase; rank 0 writes the report."""
-    require_simulator()
+    from lerobot_policy_pi05_geometry.sim.configuration import require_mujoco
+
+    require_mujoco()
     from lerobot_policy_pi05_geometry.study.growth_report import write_growth_report
     from lerobot_policy_pi05_geometry.study.launch import rank, wait_for
     from lerobot_policy_pi05_geometry.study.plan import phases
     from lerobot_policy_pi05_geometry.study.pretraining import PretrainingRun
     from lerobot_policy_pi05_geometry.study.report import write_report
     from lerobot_policy_pi05_geometry.study.simulated import SimulatedRun
-    from lerobot_policy_pi05_geometry.study.spec import read_spec
+    from lerobot_policy_pi05_geometry.study.spec import read_spec, require_tasks
 
     spec = read_spec(name)
+    require_tasks(spec)
     grows = len(spec.growth.multiples) > 1
     if grows and rank() == 0:
         _print_estimate(name, output)
@@ -141,10 +144,14 @@ def _simulated_study(name: str, output: Path, workers: int | None, retry_crashed
 
 
 def _print_estimate(name: str, output: Path) -> None:
+    from lerobot_policy_pi05_geometry.sim.configuration import require_mujoco
+
+    require_mujoco()
     from lerobot_policy_pi05_geometry.study.estimate import estimate, measure_costs
-    from lerobot_policy_pi05_geometry.study.spec import read_spec
+    from lerobot_policy_pi05_geometry.study.spec import read_spec, require_tasks
 
     spec = read_spec(name)
+    require_tasks(spec)
     costs = measure_costs(spec.budget, spec.comparisons[0].tasks[0])
     hours = estimate(spec, output, costs)
     console.print(

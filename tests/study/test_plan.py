@@ -166,7 +166,7 @@ def test_a_condition_of_denoising_steps_reaches_the_policy(arm, tmp_path, monkey
     monkeypatch.setattr(simulated, "load_policy", lambda *_, **options: given.append(options) or loaded)
     run = next(run for run in runs_of(SPEC, tmp_path) if run.arm_name == arm)
     for condition in ("inside", "steps-3", "steps-10"):
-        run.load(condition, None)
+        run.load(condition, run.simulated.environment("train", 28))
     assert given == [
         {"num_inference_steps": steps} for steps in (DENOISING_STEPS, 3, 10)
     ]  # whatever the checkpoint has

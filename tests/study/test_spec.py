@@ -71,7 +71,7 @@ def test_the_default_study_is_the_one_that_was_promised(tmp_path):
     assert len(arms) >= 3
     for task, on_task in arms.items():
         assert {"blind", "rgb", "rgb-wide", "geometry"} <= on_task
-        assert conditions[task, "geometry"] == set(CONDITIONS) - {"far"}
+        assert conditions[task, "geometry"] == set(CONDITIONS) - {"far", "fixed", "plus"}
         assert all({"inside", "outside"} <= conditions[task, arm] for arm in on_task)
 
 
@@ -228,3 +228,51 @@ def test_a_warm_start_is_read_and_reaches_the_worker(tmp_path):
 def test_a_warm_start_that_does_not_fit_is_refused(tmp_path, change, message):
     with pytest.raises(ValueError, match=message):
         read_spec(write(tmp_path, GROWING.replace(*change)))
+
+
+LIBERO = """
+seeds = [0]
+[[compare]]
+tasks = ["{task}"]
+arms = ["{arm}"]
+conditions = ["{condition}"]
+"""
+
+
+def test_a_task_of_libero_needs_no_libero_to_be_read(tmp_path):
+    path = tmp_path / "libero.toml"
+    path.write_text(LIBERO.format(task="libero_goal/8-far-front", arm="blind", condition="plus"))
+    (run,) = runs_of(read_spec(path), tmp_path)
+    assert (run.simulated.views, run.simulated.action_dim) == (("front",), 7)
+    assert json.loads(run.options["policy.input_features"])["observation.state"]["shape"] == [8]
+    environment = run.simulated.environment("outside", 84, "noisy")
+    assert (environment.task, environment.task_ids, environment.placement) == ("libero_goal", [8], "far")
+    assert run.folder.parent == tmp_path / "runs"
+
+
+@pytest.mark.parametrize(
+    ("task", "arm", "condition", "message"),
+    [
+        ("libero_goal/8", "rgb", "inside", "a task of LIBERO is a suite"),
+        ("libero_10/8-near", "rgb", "inside", "a task of LIBERO is a suite"),
+        ("libero_goal/8-away", "rgb", "inside", "placement of objects"),
+        ("libero_goal/8-near", "rgb", "far", "no camera range 'far'"),
+        ("libero_goal/8-near", "rgb-wide", "inside", "no camera range 'wide'"),
+        ("button-press-topdown-wide", "rgb", "plus", "no camera range 'plus'"),
+    ],
+)
+def test_a_task_and_what_it_lacks_is_refused(task, arm, condition, message, tmp_path):
+    path = tmp_path / "libero.toml"
+    path.write_text(LIBERO.format(task=task, arm=arm, condition=condition))
+    with pytest.raises(ValueError, match=message):
+        read_spec(path)
+
+
+def test_tasks_that_one_pretraining_cannot_serve_are_refused(tmp_path):
+    path = tmp_path / "libero.toml"
+    content = LIBERO.format(task="libero_goal/8-near-front", arm="rgb", condition="inside")
+    path.write_text(
+        content.replace("[[compare]]", '[pretrain]\ntasks = ["libero_goal/0-near"]\ncameras = "train"\n[[compare]]')
+    )
+    with pytest.raises(ValueError, match="same cameras, state and actions"):
+        read_spec(path)

@@ -71,18 +71,29 @@ class MetaworldRgbdEnv(EnvConfig):
         return {self.type: {0: vector}}
 
 
-def require_simulator() -> None:
-    """Raise ModuleNotFoundError with installation advice unless MuJoCo, Meta-World and an EGL library are available."""
+def require_mujoco() -> None:
+    """Raise ModuleNotFoundError with installation advice unless MuJoCo and an EGL library are available."""
     try:
-        from . import headless  # noqa: F401  MuJoCo first: Meta-World imports it too
+        from . import headless  # noqa: F401
 
-        import metaworld.policies  # noqa: F401  isort: skip
         import mujoco.gl_context  # noqa: F401  isort: skip
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            f"The simulated tasks need {error.name}; install them with `pip install 'lerobot_policy_pi05_geometry[sim]'`."
+            f"The simulated tasks need {error.name}; install them with `pip install 'lerobot_policy_pi05_geometry[sim]'`, or "
+            "with `[libero]` for LIBERO's."
         ) from error
     except (ImportError, AttributeError) as error:
         raise ModuleNotFoundError(
             "MuJoCo finds no EGL library for headless rendering; install one (Debian: apt-get install libegl1)."
+        ) from error
+
+
+def require_simulator() -> None:
+    """Raise ModuleNotFoundError with installation advice unless MuJoCo, Meta-World and an EGL library are available."""
+    require_mujoco()  # first: Meta-World imports it too, and it must find its way to render without a display
+    try:
+        import metaworld.policies  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"Meta-World's tasks need {error.name}; install them with `pip install 'lerobot_policy_pi05_geometry[sim]'`."
         ) from error

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.envs import preprocess_observation
+from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from scipy.stats import binomtest
 
 from ..checkpoint.load import LoadedPolicy
-from .configuration import MetaworldRgbdEnv
 
 CONFIDENCE = 0.95
 
@@ -66,14 +66,14 @@ class Evaluation:
 
 def evaluate(
     loaded: LoadedPolicy,
-    environment: MetaworldRgbdEnv,
+    environment: EnvConfig,
     episodes: int,
     first_seed: int = 0,
     parallel: int = 10,
     videos: int = 0,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Evaluation:
-    """Run `episodes` episodes on the seeds first_seed, first_seed + 1, ...
+    """Run `episodes` episodes of an environment with one task on the seeds first_seed, first_seed + 1, ...
 
     The sampler's noise is seeded per batch of episodes, so that an evaluation is reproducible. parallel: episodes stepped
     together. videos: number of first episodes whose frames are kept. progress: called with the number of finished
@@ -81,7 +81,7 @@ def evaluate(
     """
     result = Evaluation()
     parallel = min(parallel, episodes)
-    vector = environment.create_envs(parallel)[environment.type][0]
+    ((vector,),) = (tasks.values() for tasks in environment.create_envs(parallel).values())
     try:
         for start in range(0, episodes, parallel):
             seeds = [first_seed + start + i for i in range(parallel)]

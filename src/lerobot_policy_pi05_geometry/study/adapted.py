@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs.configs import EnvConfig
 
 from ..checkpoint.load import LoadedPolicy
-from ..sim.configuration import MetaworldRgbdEnv
-from ..sim.environment import FPS
 from .conditions import find_condition
 from .modulation import LEARNING_RATE, adapt
 from .recordings import Recording
@@ -54,13 +53,13 @@ class AdaptedRun(SimulatedRun):
         for condition in self.distinct_conditions():
             self.demonstration(condition).make(report_progress)
 
-    def load(self, condition: str, environment: MetaworldRgbdEnv) -> LoadedPolicy:
+    def load(self, condition: str, environment: EnvConfig) -> LoadedPolicy:
         loaded = super().load(condition, environment)
         demonstration, config = self.demonstration(condition), loaded.policy.config
         dataset = LeRobotDataset(
             demonstration.repo_id,
             root=demonstration.folder,
-            delta_timestamps={"action": [step / FPS for step in range(config.chunk_size)]},
+            delta_timestamps={"action": [step / environment.fps for step in range(config.chunk_size)]},
             depth_output_unit=config.depth_unit,
         )
         adapt(loaded, dataset, self.budget.adaptation_steps, self.budget.batch_size, self.seed)

@@ -3,9 +3,10 @@
 An arm is a set of `--policy.*` options of lerobot-train, added to the budget's. So anyone can train it without a study.
 """
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-BLIND_INPUTS = '{"observation.state": {"type": "STATE", "shape": [4]}}'
 DEPTH, POSE = "depth", "pose"  # what an arm may read besides RGB, and what a faulty sensor may change
 
 
@@ -15,6 +16,7 @@ class Arm:
 
     title: shown in the report. options: of lerobot-train, without the dashes. cameras: range of camera poses in its
     training data. reads: depth, and the camera's pose. A fault of what an arm does not read does not affect it.
+    blind: its only input is the state, see `blind_inputs`.
     adapts: the arm whose trained policy is adapted to each condition with one demonstration; None: trained itself.
     """
 
@@ -22,7 +24,13 @@ class Arm:
     options: dict[str, str] = field(default_factory=dict)
     cameras: str = "train"
     reads: frozenset[str] = frozenset()
+    blind: bool = False
     adapts: str | None = None
+
+
+def blind_inputs(shape: Sequence[int]) -> dict[str, str]:
+    """Options of a blind arm, for a state of this shape."""
+    return {"policy.input_features": json.dumps({"observation.state": {"type": "STATE", "shape": list(shape)}})}
 
 
 _DEPTH_AND_POSE = frozenset({DEPTH, POSE})
@@ -38,7 +46,7 @@ _AUGMENTATION = {"noise": "0.005", "holes": "0.1", "scale": "0.02", "shift": "0.
 _NO_GEOMETRY = {"policy.geometry_source": "none"}
 
 ARMS = {
-    "blind": Arm("no camera: the blind floor", {**_NO_GEOMETRY, "policy.input_features": BLIND_INPUTS}),
+    "blind": Arm("no camera: the blind floor", _NO_GEOMETRY, blind=True),
     "rgb": Arm("RGB only: plain π0.5", _NO_GEOMETRY),
     "rgb-wide": Arm("RGB only, trained on the wide camera range", _NO_GEOMETRY, cameras="wide"),
     # Rays alone show nothing of the scene, so samples without images would only be lost.

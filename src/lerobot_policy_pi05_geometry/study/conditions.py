@@ -13,8 +13,9 @@ _STEPS = re.compile(r"(?:(?P<condition>.+)-)?steps-(?P<count>[1-9][0-9]*)")
 
 @dataclass(frozen=True)
 class Condition:
-    """One condition. cameras: range of camera poses (sim/cameras.py). sensor: depth sensor (sim/sensor.py).
+    """One condition.
 
+    cameras: range of camera poses (sim/cameras.py, sim/libero/cameras.py). sensor: depth sensor (sim/sensor.py).
     changes: what the sensor's fault changes, depth or the camera's pose; None for an ideal sensor.
     denoising_steps: of a chunk.
     """
@@ -29,6 +30,8 @@ class Condition:
 CONDITIONS = {
     "inside": Condition("camera within the training range"),
     "outside": Condition("camera outside the training range", cameras="outside"),
+    "fixed": Condition("the stock camera", cameras="fixed"),
+    "plus": Condition("LIBERO-Plus's range of cameras", cameras="plus"),
     "far": Condition("camera far outside the training range", cameras="far"),
     "noise": Condition("depth with a structured-light sensor's noise and holes", sensor="noisy", changes=DEPTH),
     "depth-off": Condition("depth camera off", sensor="off", changes=DEPTH),

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies import make_policy, make_pre_post_processors
 from torch.utils.data import default_collate
 
 from ..checkpoint.load import LoadedPolicy
 from ..configuration_pi05_geometry import PI05GeometryConfig
-from ..sim.configuration import MetaworldRgbdEnv
-from ..sim.environment import FPS
 from ..sim.evaluate import evaluate
 from .adapted import AdaptedRun
 from .conditions import DENOISING_STEPS
@@ -24,8 +22,8 @@ from .plan import runs_of, sweep_runs
 from .pretraining import PretrainingRun, pretraining_run
 from .recordings import Recording
 from .simulated import SimulatedRun
+from .simulated_tasks import simulated_task
 from .spec import Budget, StudySpec
-from .training_options import ACTION_DIM
 
 _RECORDED, _TRAINED = 2, 3  # episodes and steps of the measurement
 
@@ -59,7 +57,7 @@ def measure_costs(budget: Budget, task: str) -> Costs:
         recorded = time.process_time() - start
         loaded = _new_policy(budget, recording)
         step = _time_steps(loaded, recording, budget)
-        environment = MetaworldRgbdEnv(task=task, image_size=budget.image_size)
+        environment = simulated_task(task).environment("train", budget.image_size)
         episodes = min(budget.parallel, budget.evaluation_episodes)
         start = time.process_time()
         evaluate(loaded, environment, episodes, parallel=episodes)
@@ -115,13 +113,13 @@ def _new_policy(budget: Budget, recording: Recording) -> LoadedPolicy:
         image_resolution=(budget.image_size, budget.image_size),
         chunk_size=budget.chunk_size,
         n_action_steps=budget.action_steps,
-        max_action_dim=ACTION_DIM,
+        max_action_dim=recording.simulated.action_dim,
         num_inference_steps=DENOISING_STEPS,
         flow_samples=budget.flow_samples,
         device=budget.device,
         push_to_hub=False,
     )
-    meta = LeRobotDataset(recording.repo_id, root=recording.folder).meta
+    meta = LeRobotDatasetMetadata(recording.repo_id, root=recording.folder)
     policy = make_policy(config, ds_meta=meta)
     return LoadedPolicy(policy, *make_pre_post_processors(policy.config, dataset_stats=meta.stats))
 
@@ -129,13 +127,9 @@ def _new_policy(budget: Budget, recording: Recording) -> LoadedPolicy:
 def _time_steps(loaded: LoadedPolicy, recording: Recording, budget: Budget) -> float:
     """Core-seconds of a training step, after one step that warms up."""
     policy = loaded.policy
-    frames = FramesInMemory(
-        LeRobotDataset(
-            recording.repo_id,
-            root=recording.folder,
-            delta_timestamps={"action": [step / FPS for step in range(budget.chunk_size)]},
-        )
-    )
+    fps = LeRobotDatasetMetadata(recording.repo_id, root=recording.folder).fps
+    chunk = {"action": [step / fps for step in range(budget.chunk_size)]}
+    frames = FramesInMemory(LeRobotDataset(recording.repo_id, root=recording.folder, delta_timestamps=chunk))
     batch = default_collate([frames[index % len(frames)] for index in range(budget.batch_size)])
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     policy.train()

@@ -5,7 +5,6 @@ another path than the recorded one, and small errors may add up to failure. The 
 predicted.
 """
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from torch.utils.data import default_collate
 from ..checkpoint.load import LoadedPolicy, load_policy
 from ..dataset_folder import require_dataset
 from ..geometry.keys import DEPTH_SUFFIX, depth_features, find_depth_key, is_depth_key
-from .arms import DEPTH, find_arm
+from .arms import DEPTH, blind_inputs, find_arm
 from .runs import ReportProgress, Run, option_list, versions
 from .training import train_with
 
@@ -115,15 +114,14 @@ class HeldOutRun(Run):
 
     def _blind_inputs(self) -> dict[str, str]:
         """Inputs of the blind arm, with this dataset's state size."""
-        if self.arm.options.get("policy.input_features") is None:
+        if not self.arm.blind:
             return {}
         features = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).features
         if OBS_STATE not in features:
             raise ValueError(
                 f"{self.dataset_root} has no {OBS_STATE}, so a blind policy has no input; leave that arm out."
             )
-        shape = list(features[OBS_STATE]["shape"])
-        return {"policy.input_features": json.dumps({OBS_STATE: {"type": "STATE", "shape": shape}})}
+        return blind_inputs(features[OBS_STATE]["shape"])
 
     def evaluate(self, condition: str, report_progress: ReportProgress) -> None:
         config = TrainPipelineConfig.from_pretrained(self.checkpoint)

@@ -7,12 +7,11 @@ from typing import Any
 
 from ..checkpoint.conversion import export
 from ..checkpoint.load import load_policy
-from ..sim.cameras import find_range
-from ..sim.configuration import MetaworldRgbdEnv
 from ..sim.evaluate import Evaluation, evaluate
 from .arms import ARMS
-from .recordings import PACKAGES, Recording, merge_recordings
+from .recordings import Recording, merge_recordings
 from .runs import ReportProgress, Run, option_list, short_hash, versions
+from .simulated_tasks import SimulatedTask, simulated_task
 from .spec import Budget, Pretraining
 from .training import train_with
 from .training_options import dataset_options, network_options, training_options
@@ -47,6 +46,11 @@ class PretrainingRun(Run):
             Recording(self.root, task, about.cameras, about.episodes, self.budget.image_size) for task in about.tasks
         ]
 
+    @property
+    def simulated(self) -> SimulatedTask:
+        """Its first task; the others have the same cameras and sizes."""
+        return simulated_task(self.pretraining.tasks[0])
+
     def data_description(self) -> dict[str, Any]:
         """Everything that the training data depends on."""
         return {"recordings": [recording.description() for recording in self.recordings]}
@@ -67,12 +71,12 @@ class PretrainingRun(Run):
             "pretraining": {name: v for name, v in asdict(self.pretraining).items() if name != "evaluated"},
             "budget": budget,
             "data": self.data_description(),
-            "versions": versions(*PACKAGES),
+            "versions": versions(*self.simulated.packages),
         }
 
     def evaluation_description(self, condition: str) -> dict[str, Any]:
         return {
-            "cameras": asdict(find_range(self.pretraining.cameras)),
+            "cameras": self.simulated.camera_description(self.pretraining.cameras),
             "budget": {name: getattr(self.budget, name) for name in EVALUATION},
         }
 
@@ -93,7 +97,7 @@ class PretrainingRun(Run):
         about = self.pretraining
         return option_list(
             {
-                **network_options(self.budget),
+                **network_options(self.budget, self.simulated.action_dim),
                 **training_options(self.budget, about.steps, about.learning_rate, about.seed, self.log_every),
                 **ARMS["rgb"].options,
                 **dataset_options(self.data_folder, "local/pretraining", output),
@@ -107,7 +111,7 @@ class PretrainingRun(Run):
 
     def evaluate(self, condition: str, report_progress: ReportProgress) -> None:
         budget = self.budget
-        environment = MetaworldRgbdEnv(task=condition, cameras=self.pretraining.cameras, image_size=budget.image_size)
+        environment = simulated_task(condition).environment(self.pretraining.cameras, budget.image_size)
         evaluate(
             load_policy(self.checkpoint, budget.device, environment),
             environment,

@@ -2,7 +2,8 @@
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,9 @@ from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from ..data.quantiles import write_frame_quantiles
-from ..sim.cameras import find_range
-from ..sim.record import record
-from ..sim.tasks import find_task
 from .locks import folder_lock
-from .runs import ReportProgress, short_hash, versions
-
-PACKAGES = ("lerobot_policy_pi05_geometry", "lerobot", "torch", "mujoco", "metaworld")
+from .runs import ReportProgress, file_name, short_hash, versions
+from .simulated_tasks import SimulatedTask, simulated_task
 
 
 @dataclass(frozen=True)
@@ -33,32 +30,36 @@ class Recording:
     image_size: int
     seed: int = 0
 
+    @cached_property
+    def simulated(self) -> SimulatedTask:
+        return simulated_task(self.task)
+
     def description(self) -> dict[str, Any]:
         """Everything that the episodes depend on."""
         return {
-            "task": asdict(find_task(self.task)),
-            "cameras": asdict(find_range(self.cameras)),
+            "task": self.simulated.description(),
+            "cameras": self.simulated.camera_description(self.cameras),
             "episodes": self.episodes,
             "image_size": self.image_size,
             "seed": self.seed,
-            "versions": versions(*PACKAGES),
+            "versions": versions(*self.simulated.packages),
         }
 
     @property
     def folder(self) -> Path:
-        return self.root / "data" / f"{self.task}-{self.cameras}-{short_hash(self.description())}"
+        return self.root / "data" / f"{file_name(self.task)}-{self.cameras}-{short_hash(self.description())}"
 
     @property
     def repo_id(self) -> str:
-        return f"local/{self.task}"
+        return f"local/{file_name(self.task)}"
 
     def make(self, report_progress: ReportProgress) -> None:
         """Record the episodes, unless the dataset exists. Several processes may call this at the same time."""
         with folder_lock(self.folder):
             if self.folder.exists():
                 return
-            progress = record(
-                self.folder, self.repo_id, self.task, self.episodes, self.cameras, self.image_size, seed=self.seed
+            progress = self.simulated.record(
+                self.folder, self.repo_id, self.episodes, self.cameras, self.image_size, self.seed
             )
             for done, _ in progress:
                 report_progress(f"record {self.task}", done, self.episodes)

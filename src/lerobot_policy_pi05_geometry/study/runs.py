@@ -104,7 +104,7 @@ class Run(ABC):
 
     def outcome(self, condition: str) -> Path:
         """File of the outcome under one of its distinct conditions."""
-        return self.folder / f"{condition}-{short_hash(self.evaluation_description(condition))}.npz"
+        return self.folder / f"{file_name(condition)}-{short_hash(self.evaluation_description(condition))}.npz"
 
     def missing(self) -> list[str]:
         """Conditions that have not been evaluated yet."""
@@ -128,6 +128,11 @@ def versions(*packages: str) -> dict[str, str]:
 def short_hash(content: dict[str, Any]) -> str:
     """First ten hexadecimal digits of a SHA-256 of the content."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:10]
+
+
+def file_name(name: str) -> str:
+    """The name of a task or a condition as part of a file's."""
+    return name.replace("/", "-")
 
 
 def option_list(options: dict[str, Any]) -> list[str]:

@@ -5,15 +5,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from lerobot.envs.configs import EnvConfig
+
 from ..checkpoint.load import LoadedPolicy, load_policy
-from ..sim.cameras import find_range
-from ..sim.configuration import MetaworldRgbdEnv
 from ..sim.evaluate import Evaluation, evaluate
 from ..sim.sensor import SENSORS
+from .arms import blind_inputs
 from .conditions import equivalent_condition, find_condition
 from .pretraining import EVALUATION, PretrainingRun, pretraining_run, read_pretraining
-from .recordings import PACKAGES, Recording
-from .runs import ReportProgress, Run, option_list, short_hash, versions
+from .recordings import Recording
+from .runs import ReportProgress, Run, file_name, option_list, short_hash, versions
+from .simulated_tasks import SimulatedTask, simulated_task
 from .spec import Budget, Pretraining
 from .training import train_with
 from .training_options import dataset_options, network_options, training_options
@@ -35,7 +37,7 @@ class SimulatedRun(Run):
     @property
     def name(self) -> str:
         times = f"-x{self.multiple}" if self.multiple > 1 else ""
-        return f"{self.task}-{self.arm_name}-{self.seed}{times}"
+        return f"{file_name(self.task)}-{self.arm_name}-{self.seed}{times}"
 
     @property
     def steps(self) -> int:
@@ -44,6 +46,15 @@ class SimulatedRun(Run):
     @property
     def evaluation_size(self) -> int:
         return self.budget.evaluation_episodes
+
+    @cached_property
+    def simulated(self) -> SimulatedTask:
+        return simulated_task(self.task)
+
+    @property
+    def options(self) -> dict[str, str]:
+        """The arm's options of lerobot-train, for this task."""
+        return {**self.arm.options, **(blind_inputs([self.simulated.state_dim]) if self.arm.blind else {})}
 
     @cached_property
     def recording(self) -> Recording:
@@ -63,26 +74,26 @@ class SimulatedRun(Run):
     def start(self) -> Path:
         """The converted checkpoint that it starts from. Runs with other numbers of steps share it."""
         assert self.origin is not None
-        content = {"origin": self.origin.description(), "options": self.arm.options, "seed": self.seed}
+        content = {"origin": self.origin.description(), "options": self.options, "seed": self.seed}
         return self.root / "starts" / f"{self.arm_name}-{self.seed}-{short_hash(content)}"
 
     def description(self) -> dict[str, Any]:
         budget = {name: value for name, value in asdict(self.budget).items() if name not in EVALUATION}
         return {
             "arm": self.arm_name,
-            "options": self.arm.options,
+            "options": self.options,
             "seed": self.seed,
             "budget": budget,
             "multiple": self.multiple,
             "origin": None if self.origin is None else self.origin.description(),
             "data": self.recording.description(),
-            "versions": versions(*PACKAGES),
+            "versions": versions(*self.simulated.packages),
         }
 
     def evaluation_description(self, condition: str) -> dict[str, Any]:
         about = find_condition(condition)
         return {
-            "cameras": asdict(find_range(about.cameras)),
+            "cameras": self.simulated.camera_description(about.cameras),
             "sensor": asdict(SENSORS[about.sensor]),
             "budget": {name: getattr(self.budget, name) for name in EVALUATION},
             "denoising_steps": about.denoising_steps,
@@ -99,7 +110,7 @@ class SimulatedRun(Run):
     def prepare(self, report_progress: ReportProgress) -> None:
         self.recording.make(report_progress)
         if self.origin is not None:
-            make_start(self.origin.pi05, self.start, self.arm, self.seed)
+            make_start(self.origin.pi05, self.start, self.arm, self.simulated.views, self.seed)
 
     def train(self, output: Path) -> None:
         train_with(self.arguments(output))
@@ -107,9 +118,9 @@ class SimulatedRun(Run):
     def arguments(self, output: Path) -> list[str]:
         """lerobot-train's arguments."""
         if self.origin is None:
-            begin = {**network_options(self.budget), **self.arm.options}
+            begin = {**network_options(self.budget, self.simulated.action_dim), **self.options}
         else:
-            begin = {"policy.path": self.start, **remaining_options(self.arm)}
+            begin = {"policy.path": self.start, **remaining_options(self.options)}
         return option_list(
             {
                 **begin,
@@ -118,16 +129,14 @@ class SimulatedRun(Run):
             }
         )
 
-    def load(self, condition: str, environment: MetaworldRgbdEnv) -> LoadedPolicy:
+    def load(self, condition: str, environment: EnvConfig) -> LoadedPolicy:
         """The policy to evaluate under a condition."""
         steps = find_condition(condition).denoising_steps
         return load_policy(self.checkpoint, self.budget.device, environment, num_inference_steps=steps)
 
     def evaluate(self, condition: str, report_progress: ReportProgress) -> None:
         about, budget = find_condition(condition), self.budget
-        environment = MetaworldRgbdEnv(
-            task=self.task, cameras=about.cameras, sensor=about.sensor, image_size=budget.image_size
-        )
+        environment = self.simulated.environment(about.cameras, budget.image_size, about.sensor)
         evaluate(
             self.load(condition, environment),
             environment,

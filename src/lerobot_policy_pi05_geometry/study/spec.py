@@ -26,10 +26,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from ..sim.cameras import find_range
-from ..sim.tasks import find_task
 from .arms import find_arm
 from .conditions import find_condition
+from .simulated_tasks import simulated_task
 
 STUDIES = Path(__file__).parent / "studies"
 
@@ -77,8 +76,7 @@ class Pretraining:
         if unknown:
             raise ValueError(f"[pretrain] evaluates {', '.join(unknown)}, on which it is not trained.")
         for task in self.tasks:
-            find_task(task)
-        find_range(self.cameras)
+            simulated_task(task).camera_description(self.cameras)
 
 
 @dataclass(frozen=True)
@@ -144,10 +142,28 @@ class StudySpec:
                     f"[growth] decides by the conditions {', '.join(self.growth.conditions)}; name them in every [[compare]] "
                     "block."
                 )
+        self._check_tasks()
         arms = {name for comparison in self.comparisons for name in comparison.arms}
         missing = sorted(set(self.sweep.arms) - arms) if self.sweep is not None else []
         if missing:
             raise ValueError(f"[sweep] names {', '.join(missing)}, which no [[compare]] block trains.")
+
+    def _check_tasks(self) -> None:
+        """Raise ValueError for an unknown task or camera range, or tasks that one pretraining cannot serve."""
+        for comparison in self.comparisons:
+            ranges = {find_condition(name).cameras for name in comparison.conditions}
+            ranges |= {find_arm(name).cameras for name in comparison.arms}
+            for task in comparison.tasks:
+                for cameras in sorted(ranges):
+                    simulated_task(task).camera_description(cameras)
+        if self.pretraining is None:
+            return
+        names = (*self.pretraining.tasks, *(task for comparison in self.comparisons for task in comparison.tasks))
+        tasks = [simulated_task(name) for name in names]
+        if len({(task.views, task.state_dim, task.action_dim) for task in tasks}) > 1:
+            raise ValueError(
+                f"[pretrain] and [[compare]] need tasks of the same cameras, state and actions, got {', '.join(names)}."
+            )
 
 
 def read_spec(path: str | Path) -> StudySpec:
@@ -173,8 +189,6 @@ def read_spec(path: str | Path) -> StudySpec:
         for name, values in lists.items():
             if not values:
                 raise ValueError(f"A [[compare]] block of {file} has no {name}.")
-        for task in lists["tasks"]:
-            find_task(task)
         comparisons.append(Comparison(**lists))
     return StudySpec(
         tuple(content.get("seeds", ())),
@@ -184,6 +198,12 @@ def read_spec(path: str | Path) -> StudySpec:
         _section(content, "growth", Growth, file) or Growth(),
         _section(content, "sweep", Sweep, file),
     )
+
+
+def require_tasks(spec: StudySpec) -> None:
+    """Raise ModuleNotFoundError with installation advice unless the simulators of a study's tasks are installed."""
+    for name in {task for comparison in spec.comparisons for task in comparison.tasks}:
+        simulated_task(name).require()
 
 
 def _section[T](content: dict[str, Any], name: str, kind: type[T], file: Path) -> T | None:

@@ -6,10 +6,10 @@ from typing import Any
 from .conditions import DENOISING_STEPS
 from .spec import Budget
 
-ACTION_DIM, WARMUP_STEPS = 4, 50
+WARMUP_STEPS = 50
 
 
-def network_options(budget: Budget) -> dict[str, Any]:
+def network_options(budget: Budget, action_dim: int) -> dict[str, Any]:
     """Options that define a new policy. A checkpoint that is trained further has them already."""
     return {
         "policy.type": "pi05_geometry",
@@ -17,7 +17,7 @@ def network_options(budget: Budget) -> dict[str, Any]:
         "policy.action_expert_variant": budget.variant,
         "policy.image_resolution": f"[{budget.image_size}, {budget.image_size}]",
         "policy.chunk_size": budget.chunk_size,
-        "policy.max_action_dim": ACTION_DIM,
+        "policy.max_action_dim": action_dim,
     }
 
 

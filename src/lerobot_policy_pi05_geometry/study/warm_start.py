@@ -1,10 +1,10 @@
 """Where a fine-tuning begins: a π0.5 checkpoint converted for an arm, as a user does it with `pi05-geometry convert`."""
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..checkpoint.conversion import GeometryStart, convert
-from ..sim.environment import CAMERA
 from .arms import Arm
 from .locks import folder_lock
 
@@ -12,12 +12,12 @@ from .locks import folder_lock
 _CONVERTED = ("geometry_source", "geometry_grid", "geometry_frame", "geometry_expert", "geometry_tokens")
 
 
-def geometry_start(arm: Arm) -> GeometryStart:
-    """The geometry that an arm's checkpoint is converted to."""
+def geometry_start(arm: Arm, views: Sequence[str]) -> GeometryStart:
+    """The geometry that an arm's checkpoint is converted to. views: the cameras that measure it."""
     source, grid, frame, expert, tokens = (arm.options.get(f"policy.{name}") for name in _CONVERTED)
     return GeometryStart(
         source,
-        cameras=None if source == "none" else (CAMERA,),
+        cameras=None if source == "none" else tuple(views),
         grid=None if grid is None else int(grid),
         frame=frame,
         expert=expert,
@@ -25,17 +25,17 @@ def geometry_start(arm: Arm) -> GeometryStart:
     )
 
 
-def remaining_options(arm: Arm) -> dict[str, str]:
+def remaining_options(options: dict[str, str]) -> dict[str, str]:
     """Options of an arm that are given to lerobot-train after the conversion."""
-    return {name: value for name, value in arm.options.items() if name.removeprefix("policy.") not in _CONVERTED}
+    return {name: value for name, value in options.items() if name.removeprefix("policy.") not in _CONVERTED}
 
 
-def make_start(pi05: Path, folder: Path, arm: Arm, seed: int) -> None:
+def make_start(pi05: Path, folder: Path, arm: Arm, views: Sequence[str], seed: int) -> None:
     """Convert a π0.5 checkpoint for an arm, unless the folder exists. seed: draws the new parameters."""
     with folder_lock(folder):
         if folder.exists():
             return
         unfinished = folder.with_name(f".{folder.name}.unfinished")
         shutil.rmtree(unfinished, ignore_errors=True)
-        convert(pi05, unfinished, geometry_start(arm), features_from_data=True, seed=seed)
+        convert(pi05, unfinished, geometry_start(arm, views), features_from_data=True, seed=seed)
         unfinished.rename(folder)
