@@ -247,7 +247,6 @@ def test_a_task_of_libero_needs_no_libero_to_be_read(tmp_path):
     assert json.loads(run.options["policy.input_features"])["observation.state"]["shape"] == [8]
     environment = run.simulated.environment("outside", 84, "noisy")
     assert (environment.task, environment.task_ids, environment.placement) == ("libero_goal", [8], "far")
-    assert run.folder.parent == tmp_path / "runs"
 
 
 @pytest.mark.parametrize(

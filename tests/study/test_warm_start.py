@@ -104,4 +104,4 @@ def test_what_defines_new_weights_is_decided_by_the_conversion(arm, runs, tmp_pa
     config = PreTrainedConfig.from_pretrained(tmp_path / "start")
     given = {name.removeprefix("policy."): value for name, value in ARMS[arm].options.items()}
     assert {name: str(getattr(config, name)) for name in given} == given
-    assert remaining_options(ARMS[arm]) == {}
+    assert remaining_options(ARMS[arm].options) == {}
