@@ -1,11 +1,14 @@
-"""A worker's life."""
+"""A worker's life, and what is read of its log."""
 
 import os
 import select
 import time
+from types import SimpleNamespace
 
 import pytest
 
+from lerobot_policy_pi05_geometry.study.launch import Job
+from lerobot_policy_pi05_geometry.study.training_log import TrainingCurve
 from lerobot_policy_pi05_geometry.study.worker import end_with_parent
 
 
@@ -28,3 +31,16 @@ def test_a_worker_ends_with_the_process_that_started_it():
     assert select.select([reading], [], [], 20)[0]
     assert os.read(reading, 10) == b""
     os.close(reading)
+
+
+def test_only_a_whole_line_of_progress_counts(tmp_path):
+    """A traceback quotes lines of code such as `for done, _ in progress:`."""
+    log = tmp_path / "run.log"
+    job = Job(SimpleNamespace(log=log, steps=10), None, 0, TrainingCurve(1))
+    log.write_text("WARNING:__main__:progress: record libero_goal/8-near 3/10\nprogress: record libero_goal/8-near 4/")
+    job.read_log()
+    assert (job.stage, job.done, job.total) == ("record libero_goal/8-near", 3, 10)
+    with log.open("a") as file:
+        file.write("10\n    for done, _ in progress:\n  File 'progress: a/b'\n")
+    job.read_log()
+    assert (job.stage, job.done, job.total) == ("record libero_goal/8-near", 4, 10)

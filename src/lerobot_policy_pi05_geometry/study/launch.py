@@ -8,6 +8,7 @@ output folder and do not communicate otherwise.
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ from .worker import PROGRESS
 
 logger = logging.getLogger(__name__)
 
+_PROGRESS = re.compile(rf"{PROGRESS} (?P<stage>.+) (?P<done>\d+)/(?P<total>\d+)$")
 _POLL = 2.0  # seconds between two checks of the shared folder
 _EVALUATION_COST = 2.5  # of one episode or frame, in training steps; for the estimate of the remaining time
 _CRASH_LOG_CHARACTERS = 2_000  # kept from the end of a crashed run's log
@@ -48,10 +50,8 @@ class Job:
         for line in complete.splitlines():
             if self.curve.add(line):
                 self.stage, self.done, self.total = "train", self.curve.steps[-1], self.run.steps
-            elif PROGRESS in line:
-                stage, _, count = line.split(PROGRESS)[1].strip().rpartition(" ")
-                self.stage = stage
-                self.done, self.total = map(int, count.split("/"))
+            elif (told := _PROGRESS.search(line)) is not None:
+                self.stage, self.done, self.total = told["stage"], int(told["done"]), int(told["total"])
 
 
 @dataclass(frozen=True)

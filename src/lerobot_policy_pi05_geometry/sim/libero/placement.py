@@ -72,10 +72,11 @@ def _interest(scene: LiberoScene) -> set[str]:
     return {name for name in scene.env.objects_dict if any(other.startswith(name) for other in named)}
 
 
-def place_anew(scene: LiberoScene, spread: float, generator: np.random.Generator) -> None:
+def place_anew(scene: LiberoScene, spread: float, generator: np.random.Generator) -> bool:
     """Move the objects of interest by up to `spread` metres in x and y, where they touch nothing and can be reached.
 
-    Raises RuntimeError if no such place is found.
+    Returns whether such places were found: a fixture may stand where an object could. Raises ValueError if a task has no
+    object to move.
     """
     names = movable(scene)
     if not names:
@@ -89,8 +90,8 @@ def place_anew(scene: LiberoScene, spread: float, generator: np.random.Generator
             continue
         _shift(scene, before, shifts)
         if _stays(scene, names):
-            return
-    raise RuntimeError(f"No free place was found for {', '.join(names)} of {scene.task.key} within ±{spread} m.")
+            return True
+    return False
 
 
 def _free(scene: LiberoScene, boxes: dict[str, np.ndarray], shifts: dict[str, np.ndarray]) -> bool:

@@ -14,6 +14,7 @@ from .tasks import PLACEMENTS, LiberoTask
 
 FPS = 20
 SETTLE_STEPS = 10  # as LeRobot: objects of the initial states float or intersect a little
+LAYOUTS = 20  # fixtures drawn anew if they leave no place for the objects
 NO_MOTION = np.array([0, 0, 0, 0, 0, 0, -1.0])  # and an open gripper
 _OBSERVABLE = "calibrated_frames"
 
@@ -112,31 +113,41 @@ class LiberoScene:
         placement: `stock` is LIBERO's initial state number `seed` (modulo their number), with the fixtures' poses drawn
         by the seed; otherwise objects of interest are then placed anew. state: start from this flattened state instead.
         """
-        from robosuite.utils.errors import RandomizationError
-
         if placement not in PLACEMENTS:
             raise ValueError(f"There is no placement '{placement}'; choose one of: {', '.join(PLACEMENTS)}.")
         self._watching = False
         self.move_camera(camera or CameraMove())
-        with numpy_seed(seed):
-            while True:
-                try:
-                    self.env.reset()
-                    break
-                except RandomizationError:  # LIBERO's sampler found no free place: it draws again
-                    continue
         if state is None:
             if self._states is None:
                 self._states = self.task.initial_states()
             state = self._states[seed % len(self._states)]
-        self.control.set_init_state(state)
-        if placement != "stock":
-            place_anew(self, PLACEMENTS[placement], np.random.default_rng(seed))
+        generator = np.random.default_rng(seed)
+        with numpy_seed(seed):
+            for _ in range(LAYOUTS):
+                self._draw_fixtures()
+                self.control.set_init_state(state)
+                if placement == "stock" or place_anew(self, PLACEMENTS[placement], generator):
+                    break
+            else:
+                raise RuntimeError(
+                    f"{self.task.key} has no free places within ±{PLACEMENTS[placement]} m; use 'stock'."
+                )
         for step in range(SETTLE_STEPS):
             self._watching = step == SETTLE_STEPS - 1
             observation = self.env.step(NO_MOTION)[0]
         self._watching = True
         return observation
+
+    def _draw_fixtures(self) -> None:
+        """A new episode, with the fixtures' poses drawn from numpy's global generator."""
+        from robosuite.utils.errors import RandomizationError
+
+        while True:
+            try:
+                self.env.reset()
+                return
+            except RandomizationError:  # LIBERO's sampler found no free place: it draws again
+                continue
 
     def step(self, action: np.ndarray) -> tuple[dict, bool]:
         """Apply an action, (7,) in [-1, 1]; returns robosuite's observation and whether the goal is reached."""
