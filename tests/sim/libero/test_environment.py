@@ -23,6 +23,7 @@ def environment():
     from lerobot_policy_pi05_geometry.sim.libero.environment import RgbdLiberoEnv
 
     built = RgbdLiberoEnv(*TASK, cameras="plus", placement="near", image_size=SIZE, rendering="fast")
+    built.reset(seed=0)  # robosuite's controller: the first episode of a process differs from its repetitions by 0.2 mm
     yield built
     built.close()
 
@@ -154,8 +155,8 @@ def test_objects_placed_anew_touch_nothing_and_differ_between_seeds(environment)
     assert np.ptp(np.stack(places), axis=0).max() > 0.03
 
 
-def test_fixtures_that_leave_no_place_are_drawn_anew(environment):
-    """With this seed's first fixtures no bowl could be placed within 2,000 tries."""
+def test_an_initial_state_without_room_gives_way_to_the_next(environment):
+    """In this seed's own state, number 20, the plate stands between what stays: no place was found in 2,000 tries."""
     environment.reset(seed=1_000_020)
     assert environment.scene.frames
 

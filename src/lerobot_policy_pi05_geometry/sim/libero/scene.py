@@ -14,7 +14,7 @@ from .tasks import PLACEMENTS, LiberoTask
 
 FPS = 20
 SETTLE_STEPS = 10  # as LeRobot: objects of the initial states float or intersect a little
-LAYOUTS = 20  # fixtures drawn anew if they leave no place for the objects
+STATES = 10  # initial states to try: in some, objects that stay leave no place for those that are moved
 NO_MOTION = np.array([0, 0, 0, 0, 0, 0, -1.0])  # and an open gripper
 _OBSERVABLE = "calibrated_frames"
 
@@ -111,27 +111,24 @@ class LiberoScene:
         """A seed's layout, settled. Returns robosuite's observation.
 
         placement: `stock` is LIBERO's initial state number `seed` (modulo their number), with the fixtures' poses drawn
-        by the seed; otherwise objects of interest are then placed anew. state: start from this flattened state instead.
+        by the seed; otherwise objects of interest are then placed anew, in the first state from that number on that has room
+        for them. state: start from this flattened state instead.
         """
         if placement not in PLACEMENTS:
             raise ValueError(f"There is no placement '{placement}'; choose one of: {', '.join(PLACEMENTS)}.")
         self._watching = False
         self.move_camera(camera or CameraMove())
-        if state is None:
-            if self._states is None:
-                self._states = self.task.initial_states()
-            state = self._states[seed % len(self._states)]
-        generator = np.random.default_rng(seed)
         with numpy_seed(seed):
-            for _ in range(LAYOUTS):
-                self._draw_fixtures()
-                self.control.set_init_state(state)
-                if placement == "stock" or place_anew(self, PLACEMENTS[placement], generator):
-                    break
-            else:
-                raise RuntimeError(
-                    f"{self.task.key} has no free places within ±{PLACEMENTS[placement]} m; use 'stock'."
-                )
+            self._draw_fixtures()
+        if self._states is None:
+            self._states = self.task.initial_states()
+        generator = np.random.default_rng(seed)
+        for number in range(seed, seed + STATES):
+            self.control.set_init_state(self._states[number % len(self._states)] if state is None else state)
+            if placement == "stock" or place_anew(self, PLACEMENTS[placement], generator):
+                break
+        else:
+            raise RuntimeError(f"{self.task.key} has no free places within ±{PLACEMENTS[placement]} m; use 'stock'.")
         for step in range(SETTLE_STEPS):
             self._watching = step == SETTLE_STEPS - 1
             observation = self.env.step(NO_MOTION)[0]
