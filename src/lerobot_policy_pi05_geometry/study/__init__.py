@@ -6,6 +6,7 @@
    conditions       camera poses and depth sensors of an evaluation
    plan             the runs of a study, in phases                  stopping    when an arm has stopped improving
    runs             one run: its inputs, its hash, its folder       worker      executes one run: record, train, evaluate
+   simulated_tasks  Meta-World's and LIBERO's tasks alike
    recordings       expert episodes                                 launch      several runs at once, on one or more machines
    pretraining      the π0.5 that a study starts from               warm_start  converting it for an arm
    simulated        a run in the simulator                          adapted     a run that adapts another run's policy
