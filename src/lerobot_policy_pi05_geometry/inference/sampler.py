@@ -164,7 +164,7 @@ class ChunkSampler(nn.Module):
             "geometry": self._explain_geometry(),
             "real-time chunking": f"active: {network.rtc_mode}" if network.rtc_enabled else "off",
             **self._explain_graphs(active),
-            "compilation": "left out: on a CPU it gains less than it costs (docs/results.md); on a GPU it has not been measured",
+            "compilation": "left out: on a CPU it costs more than it gains (docs/results-speed.md); not measured on a GPU",
         }
 
     def _explain_geometry(self) -> str:

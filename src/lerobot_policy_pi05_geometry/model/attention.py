@@ -2,7 +2,7 @@
 
 There are two implementations. `scaled_dot_product_attention` is the default. It falls back to its slow path when the mask
 needs a gradient, as the suffix's mask does while the gate is trained. In this case the code computes two matrix products and
-a softmax. benchmarks/attention.py measures both (docs/results.md).
+a softmax. benchmarks/attention.py measures both (docs/results-speed.md).
 
 Shapes: B batch, H query heads, KV key/value heads, Q queries, K keys, D head_dim.
 """
