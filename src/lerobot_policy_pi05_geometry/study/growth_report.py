@@ -14,6 +14,7 @@ from .claims import claims
 from .conditions import azimuth_of, find_condition, order_of
 from .pretraining import PretrainingRun
 from .results import cells, episodes_table, success_matrix
+from .runs import file_name
 from .simulated import SimulatedRun
 from .spec import StudySpec
 from .statistics import wilson
@@ -167,7 +168,7 @@ def _task(page: Page, task: str, rows: pd.DataFrame, pictures: Path) -> None:
         bars[arm] = [None if cell is None else (cell.rate, *cell.interval()) for cell in of_arm]
     titles = [find_condition(name).title for name in names]
     caption = "Success after the longest training of each arm, over all training seeds."
-    page.row(picture(success_figure(titles, bars), caption, pictures / f"success_{task}.png"))
+    page.row(picture(success_figure(titles, bars), caption, pictures / f"success_{file_name(task)}.png"))
     multiples = rows.groupby("arm")["multiple"].max()
     table = []
     for arm in arms:

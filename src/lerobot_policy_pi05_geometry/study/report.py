@@ -16,6 +16,7 @@ from ..inspect.pictures import depth_figure, layout_figure, segment_share_figure
 from .arms import ARMS
 from .conditions import find_condition, order_of
 from .results import ArmComparison, Cell, cells, comparisons, episodes_table, pooled_difference
+from .runs import file_name
 from .simulated import SimulatedRun
 from .training_log import read_curve
 
@@ -149,7 +150,7 @@ def _task(
     bars = {arm: [_bar(by_name.get((arm, condition))) for condition in conditions] for arm in arms}
     titles = [find_condition(condition).title for condition in conditions]
     caption = "Success per arm and condition over all training seeds. The table has each training seed in brackets."
-    page.row(picture(success_figure(titles, bars), caption, pictures / f"success_{task}.png"))
+    page.row(picture(success_figure(titles, bars), caption, pictures / f"success_{file_name(task)}.png"))
     parameters = {run.arm_name: _parameters(run) for run in _finished(runs) if run.task == task}
     page.table(
         ["arm", "what it is", "parameters", *titles],
@@ -178,7 +179,7 @@ def _task(
         clips = _side_by_side([run for run in runs if run.task == task], shown, condition)
         if clips is not None:
             title = f"From left: {', '.join(shown)}. {find_condition(condition).title.capitalize()}."
-            page.row(video(clips, 10, title, pictures / f"rollout_{task}_{condition}.mp4"))
+            page.row(video(clips, 10, title, pictures / f"rollout_{file_name(task)}_{condition}.mp4"))
 
 
 def _trained_policy(page: Page, runs: Sequence[SimulatedRun], pictures: Path) -> None:
@@ -188,7 +189,7 @@ def _trained_policy(page: Page, runs: Sequence[SimulatedRun], pictures: Path) ->
     page.heading("Attention and training")
     if first is not None:
         loaded = load_policy(first.checkpoint)
-        batch = loaded.preprocess(frame_batch(LeRobotDataset(f"local/{first.task}", root=first.data_folder), 0))
+        batch = loaded.preprocess(frame_batch(LeRobotDataset(first.recording.repo_id, root=first.data_folder), 0))
         caption = (
             "The first frame of the dataset. Right: attention of the action tokens on geometry at the last denoising "
             "step, mean over layers, heads and tokens."
