@@ -120,11 +120,13 @@ class LiberoScene:
         self.move_camera(camera or CameraMove())
         with numpy_seed(seed):
             self._draw_fixtures()
-        if self._states is None:
-            self._states = self.task.initial_states()
+        if state is not None:
+            states = state[None]
+        else:
+            states = self._states = self.task.initial_states() if self._states is None else self._states
         generator = np.random.default_rng(seed)
         for number in range(seed, seed + STATES):
-            self.control.set_init_state(self._states[number % len(self._states)] if state is None else state)
+            self.control.set_init_state(states[number % len(states)])
             if placement == "stock" or place_anew(self, PLACEMENTS[placement], generator):
                 break
         else:
