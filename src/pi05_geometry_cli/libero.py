@@ -47,7 +47,10 @@ def libero_floors(
     suite: Annotated[str, typer.Option(help="libero_spatial, libero_object or libero_goal.")] = "libero_spatial",
     task_id: TaskIds = None,
     placement: Placement = "stock",
-    episodes: Annotated[int, typer.Option(help="Episodes of the expert, and as many of the blind plan.")] = 50,
+    episodes: Annotated[int, typer.Option(help="Episodes of the expert.")] = 50,
+    blind_episodes: Annotated[
+        int | None, typer.Option(help="Episodes of the blind plan, on the first of the same seeds. Default: as many.")
+    ] = None,
 ) -> None:
     """Measure how often the scripted expert succeeds, and how often a plan that never looks."""
     from lerobot_policy_pi05_geometry.sim.libero.floors import measure, write_floors
@@ -58,7 +61,11 @@ def libero_floors(
         bar = bars.add_task("measure floors", total=len(numbers))
         for number in numbers:
             floor = measure(
-                find_task(suite, number), placement, episodes, say=lambda text: bars.update(bar, description=text)
+                find_task(suite, number),
+                placement,
+                episodes,
+                episodes if blind_episodes is None else blind_episodes,
+                say=lambda text: bars.update(bar, description=text),
             )
             write_floors([floor], output)
             console.print(f"{suite}/{number}, {placement}: {floor}")

@@ -4,6 +4,7 @@ import importlib.metadata
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_policy_pi05_geometry.sim.libero import installation
 from lerobot_policy_pi05_geometry.sim.libero.configuration import LiberoRgbdEnv
-from lerobot_policy_pi05_geometry.sim.libero.floors import FLOORS_FILE, Floor, read_floors, write_floors
+from lerobot_policy_pi05_geometry.sim.libero.floors import FLOORS_FILE, Floor, measure, read_floors, write_floors
 from lerobot_policy_pi05_geometry.sim.libero.report import EVAL_INFO, read_results, report
+from lerobot_policy_pi05_geometry.sim.libero.tasks import LiberoTask
 
 
 def test_the_environment_is_registered_without_importing_libero_or_mujoco():
@@ -162,16 +164,23 @@ def test_every_floor_in_the_registry_is_possible():
     for (suite, index, placement), floor in read_floors().items():
         assert (floor.suite, floor.index, floor.placement) == (suite, index, placement)
         assert 0 <= floor.expert <= floor.episodes
-        assert floor.blind is None or 0 <= floor.blind <= floor.episodes
+        assert 0 <= floor.blind <= floor.blind_episodes <= floor.episodes
     assert FLOORS_FILE.is_file()
 
 
 def test_measuring_anew_replaces_an_entry_and_keeps_the_others(tmp_path):
-    old = [Floor("libero_goal", i, "t", "stock", 3, 3, None, 100, 2.0) for i in range(2)]
+    old = [Floor("libero_goal", i, "t", "stock", 3, 3, 0, 0, 100, 2.0) for i in range(2)]
     write_floors(old, tmp_path / "f.json")
-    new = Floor("libero_goal", 1, "t", "stock", 50, 49, 4, 100, 2.0)
+    new = Floor("libero_goal", 1, "t", "stock", 50, 49, 20, 4, 100, 2.0)
     write_floors([new], tmp_path / "f.json")
     assert list(read_floors(tmp_path / "f.json").values()) == [old[0], new]
+
+
+@pytest.mark.parametrize(("episodes", "blind_episodes"), [(0, 0), (5, 6), (5, -1)])
+def test_impossible_numbers_of_episodes_are_refused(episodes, blind_episodes):
+    task = LiberoTask("libero_goal", 8, "t", "t", Path("t.bddl"))
+    with pytest.raises(ValueError, match="1 episode of the expert or more"):
+        measure(task, "stock", episodes, blind_episodes)
 
 
 def eval_info(tmp_path, successes: dict[int, list[bool]]):
@@ -190,13 +199,13 @@ def test_the_report_counts_each_task_and_the_suite(tmp_path):
 
 
 def test_a_floor_of_another_placement_is_not_shown(tmp_path, monkeypatch):
-    floor = Floor("libero_goal", 8, "t", "near", 50, 49, 4, 100, 2.0)
+    floor = Floor("libero_goal", 8, "t", "near", 50, 49, 20, 4, 100, 2.0)
     monkeypatch.setattr(
         "lerobot_policy_pi05_geometry.sim.libero.report.read_floors", lambda: {("libero_goal", 8, "near"): floor}
     )
     folder = eval_info(tmp_path, {8: [True]})
-    assert "4/50 | 49/50" in report(read_results(folder, "near"), "near")
-    assert "4/50" not in report(read_results(folder, "stock"), "stock")
+    assert "4/20 | 49/50" in report(read_results(folder, "near"), "near")
+    assert "4/20" not in report(read_results(folder, "stock"), "stock")
 
 
 def test_a_folder_without_an_outcome_is_refused(tmp_path):

@@ -21,14 +21,15 @@ if TYPE_CHECKING:
 
 FLOORS_FILE = Path(__file__).parent / "floors.json"
 FIRST_SEED = 700_000  # apart from evaluation (0) and recording (1,000,000)
+SETTLING_STEPS = 20  # an object that was let go comes to rest in 1 s; then an episode without success has failed
 
 
 @dataclass(frozen=True)
 class Floor:
-    """Successes of the expert and of the blind plan in `episodes` episodes each, on the same seeds.
+    """Successes of the expert in `episodes` episodes, and of the blind plan in the first `blind_episodes` of the same seeds.
 
-    blind: None where it was not measured. steps: mean length of the expert's successful episodes. seconds: processor time
-    of an expert's episode.
+    blind_episodes: 0 where the blind plan was not measured. steps: mean length of the expert's successful episodes.
+    seconds: processor time of an expert's episode.
     """
 
     suite: str
@@ -37,13 +38,23 @@ class Floor:
     placement: str
     episodes: int
     expert: int
-    blind: int | None
+    blind_episodes: int
+    blind: int
     steps: float
     seconds: float
 
     def __str__(self) -> str:
-        blind = "not measured" if self.blind is None else f"{self.blind}/{self.episodes}"
-        return f"blind plan {blind}, expert {self.expert}/{self.episodes}"
+        return f"blind plan {self.blind_share}, expert {self.expert_share}"
+
+    @property
+    def expert_share(self) -> str:
+        """Such as `49/50`."""
+        return f"{self.expert}/{self.episodes}"
+
+    @property
+    def blind_share(self) -> str:
+        """Such as `4/20`, or `not measured`."""
+        return f"{self.blind}/{self.blind_episodes}" if self.blind_episodes else "not measured"
 
 
 def read_floors(path: Path = FLOORS_FILE) -> dict[tuple[str, int, str], Floor]:
@@ -56,36 +67,45 @@ def measure(
     task: LiberoTask,
     placement: str,
     episodes: int,
-    who: tuple[str, ...] = ("expert", "blind"),
+    blind_episodes: int,
     say: Callable[[str], None] = lambda text: None,
 ) -> Floor:
-    """Run the expert, and the blind plan if `who` names it, on one task, without rendering."""
+    """Run the expert on one task, and the blind plan on the first `blind_episodes` of the same seeds, without rendering.
+
+    Raises ValueError unless `episodes` is 1 or more and `blind_episodes` is no more than that.
+    """
+    if not 0 <= blind_episodes <= episodes or episodes < 1:
+        raise ValueError(
+            f"Floors need 1 episode of the expert or more and no more of the blind plan, got {episodes} and "
+            f"{blind_episodes}."
+        )
     from .expert.world import Memory
     from .scene import LiberoScene
 
     scene = LiberoScene(task, cameras=())
     try:
-        known = {"expert": None, "blind": Memory.of(scene, placement) if "blind" in who else None}
-        counts, steps, seconds = dict.fromkeys(who, 0), [], 0.0
+        memory = Memory.of(scene, placement) if blind_episodes else None
+        lengths, blind, seconds = [], 0, 0.0
         for episode in range(episodes):
-            for name in who:
-                started = time.process_time()
-                length = _run(scene, FIRST_SEED + episode, placement, known[name])
-                counts[name] += length is not None
-                if name == "expert":
-                    seconds += time.process_time() - started
-                    steps += [length] if length is not None else []
+            seed = FIRST_SEED + episode
+            started = time.process_time()
+            lengths.append(_run(scene, seed, placement, None))
+            seconds += time.process_time() - started
+            if episode < blind_episodes:
+                blind += _run(scene, seed, placement, memory) is not None
             say(f"{task.key} {placement}: {episode + 1} of {episodes}")
     finally:
         scene.close()
+    steps = [length for length in lengths if length is not None]
     return Floor(
         task.suite,
         task.index,
         task.name,
         placement,
         episodes,
-        counts["expert"],
-        counts.get("blind"),
+        len(steps),
+        blind_episodes,
+        blind,
         steps=round(float(np.mean(steps))) if steps else 0,
         seconds=round(seconds / episodes, 1),
     )
@@ -100,6 +120,8 @@ def _run(scene: "LiberoScene", seed: int, placement: str, memory: "Memory | None
     for step in range(scene.task.max_steps):
         if scene.step(expert.act())[1]:
             return step + 1
+        if expert.idle > SETTLING_STEPS:
+            return None
     return None
 
 

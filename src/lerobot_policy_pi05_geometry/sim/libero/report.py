@@ -63,7 +63,7 @@ def report(results: list[TaskResult], placement: str) -> str:
         "| --- | --- | --- | --- | --- |",
     ]
     lines += [
-        _row(f"{r.suite}/{r.index}", r.successes, r.episodes, _share(r.floor, "blind"), _share(r.floor, "expert"))
+        _row(f"{r.suite}/{r.index}", r.successes, r.episodes, *_floor_columns(r.floor))
         for r in results
     ]
     for suite in dict.fromkeys(result.suite for result in results):
@@ -77,6 +77,5 @@ def _row(name: str, successes: int, episodes: int, blind: str, expert: str) -> s
     return f"| {name} | {successes}/{episodes} | {low:.0%} to {high:.0%} | {blind} | {expert} |"
 
 
-def _share(floor: Floor | None, who: str) -> str:
-    count = None if floor is None else getattr(floor, who)
-    return "not measured" if floor is None or count is None else f"{count}/{floor.episodes}"
+def _floor_columns(floor: Floor | None) -> tuple[str, str]:
+    return ("not measured", "not measured") if floor is None else (floor.blind_share, floor.expert_share)

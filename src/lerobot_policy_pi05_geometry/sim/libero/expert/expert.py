@@ -16,16 +16,20 @@ class Expert:
     """One episode's expert. memory: act on remembered poses and never look (the blind plan). style: of the motion.
 
     Call `act` once per step, with the scene as it is then; after the plan's end the hand stays where it is.
+
+    idle: steps since the plan's end.
     """
 
     def __init__(self, scene: LiberoScene, memory: Memory | None = None, style: Style | None = None) -> None:
         self.world, self.hand = World(scene, memory), Hand(scene)
         self._style = style or Style()
+        self.idle = 0
         self._plan = self._reach_goal(scene.env.parsed_problem["goal_state"])
 
     def act(self) -> np.ndarray:
         """The next action, (7,) float64 in [-1, 1]."""
         action = next(self._plan, None)
+        self.idle += action is None
         return np.clip(self.hand.still() if action is None else action, -1.0, 1.0)
 
     def _reach_goal(self, goal: list) -> Iterator[np.ndarray]:
