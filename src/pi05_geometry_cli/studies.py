@@ -126,7 +126,7 @@ def _simulated_study(name: str, output: Path, workers: int | None, retry_crashed
 
     spec = read_spec(name)
     require_tasks(spec)
-    grows = len(spec.growth.multiples) > 1
+    grows = spec.growth.multiples != (1,) or spec.sweep is not None
     if grows and rank() == 0:
         _print_estimate(name, output)
     runs: list[PretrainingRun | SimulatedRun] = []

@@ -120,6 +120,20 @@ def test_the_report_holds_every_part(tmp_path):
     assert list(verdicts) == ["yes", "yes", "no", "yes", "no", "yes"]
 
 
+def test_one_multiple_above_1_and_a_sweep_have_a_report_too(tmp_path):
+    spec = dataclasses.replace(
+        SPEC,
+        comparisons=(Comparison(TASKS[:1], ("rgb", "geometry"), ("inside", "outside")),),
+        growth=Growth((4,)),
+        sweep=Sweep((-30, 0, 30), ("rgb", "geometry")),
+    )
+    runs = [run for phase in executed(tmp_path, spec) for run in phase.runs]
+    page = write_growth_report(tmp_path, spec, runs, "pi05-geometry study").read_text()
+    assert page.count("<img ") == 3  # growth, the task, sweep
+    assert "geometry succeeds in 60%" in page
+    assert set(pd.read_csv(tmp_path / "episodes.csv")["multiple"]) == {4}
+
+
 def test_the_estimate_adds_up_what_is_missing(tmp_path):
     """Counted by hand: 8 trained arm-seeds with 5 arms and 2 tasks are 20 runs for each multiple."""
     steps = Costs(step=3600.0, episode=0.0, recording=0.0)

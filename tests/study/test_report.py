@@ -2,8 +2,9 @@
 
 import pandas as pd
 
-from lerobot_policy_pi05_geometry.study.report import headline
+from lerobot_policy_pi05_geometry.study.report import floor_sentence, headline
 from lerobot_policy_pi05_geometry.study.results import cells
+from lerobot_policy_pi05_geometry.study.simulated_tasks import simulated_task
 
 
 def table(rates: dict[tuple[str, str], int], condition: str = "outside") -> pd.DataFrame:
@@ -69,3 +70,13 @@ def test_every_condition_has_its_place_in_a_report():
     rows = pd.concat([table({("t", "geometry"): 5}, condition) for condition in given])
     expected = ["inside", "steps-2", "steps-10", "outside", "outside-steps-3", "noise"]
     assert [cell.condition for cell in cells(rows)] == expected
+
+
+def test_a_task_of_libero_brings_the_floor_of_its_placement():
+    placed, stock = (simulated_task(f"libero_spatial/2-{placement}").floor() for placement in ("near", "stock"))
+    assert placed is not None
+    assert stock is not None
+    assert (placed.placement, stock.placement) == ("near", "stock")
+    shares = f"blind plan {placed.blind}/{placed.blind_episodes}, expert {placed.expert}/{placed.episodes}"
+    assert shares in floor_sentence(placed)
+    assert simulated_task("button-press-topdown-wide").floor() is None  # its study has a blind policy instead

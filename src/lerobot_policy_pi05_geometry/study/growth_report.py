@@ -13,9 +13,11 @@ from .arms import ARMS
 from .claims import claims
 from .conditions import azimuth_of, find_condition, order_of
 from .pretraining import PretrainingRun
+from .report import floor_sentence
 from .results import cells, episodes_table, success_matrix
 from .runs import file_name
 from .simulated import SimulatedRun
+from .simulated_tasks import simulated_task
 from .spec import StudySpec
 from .statistics import wilson
 from .stopping import gains, improving_arms
@@ -159,6 +161,9 @@ def _stop_rule(page: Page, spec: StudySpec, compared: pd.DataFrame) -> None:
 
 def _task(page: Page, task: str, rows: pd.DataFrame, pictures: Path) -> None:
     page.heading(task)
+    floor = simulated_task(task).floor()
+    if floor is not None:
+        page.text(floor_sentence(floor))
     found = {(cell.arm, cell.condition): cell for cell in cells(rows)}
     arms = [arm for arm in ARMS if any(key[0] == arm for key in found)]
     names = sorted({condition for _, condition in found}, key=order_of)

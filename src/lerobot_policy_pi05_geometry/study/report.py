@@ -13,11 +13,13 @@ from ..inspect.charts import curves_figure, success_figure
 from ..inspect.inspection import frame_batch
 from ..inspect.page import Page, picture, video
 from ..inspect.pictures import depth_figure, layout_figure, segment_share_figure
+from ..sim.libero.floors import Floor
 from .arms import ARMS
 from .conditions import find_condition, order_of
 from .results import ArmComparison, Cell, cells, comparisons, episodes_table, pooled_difference
 from .runs import file_name
 from .simulated import SimulatedRun
+from .simulated_tasks import simulated_task
 from .training_log import read_curve
 
 _SHOWN_IN_VIDEOS = ("geometry", "rgb", "random")
@@ -53,6 +55,14 @@ def write_report(folder: Path, runs: Sequence[SimulatedRun], command: str) -> Pa
     path = folder / "report.html"
     page.write(path)
     return path
+
+
+def floor_sentence(floor: Floor) -> str:
+    """What was measured of a task beforehand: its expert, and the plan that never looks."""
+    return (
+        f"Measured beforehand, on other seeds: {floor}. The blind plan knows the mean places of all objects and never looks; "
+        "success that does not exceed it does not show that a policy sees."
+    )
 
 
 def headline(table: pd.DataFrame) -> str:
@@ -144,6 +154,9 @@ def _task(
     page: Page, task: str, found: list[Cell], versus: list[ArmComparison], runs: Sequence[SimulatedRun], pictures: Path
 ) -> None:
     page.heading(task)
+    floor = simulated_task(task).floor()
+    if floor is not None:
+        page.text(floor_sentence(floor))
     conditions = sorted({cell.condition for cell in found}, key=order_of)
     arms = [name for name in ARMS if any(cell.arm == name for cell in found)]
     by_name = {(cell.arm, cell.condition): cell for cell in found}

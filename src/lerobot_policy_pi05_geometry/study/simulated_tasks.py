@@ -18,6 +18,7 @@ from ..sim.configuration import MetaworldRgbdEnv, require_simulator
 from ..sim.environment import CAMERA
 from ..sim.libero import cameras as libero_cameras
 from ..sim.libero.configuration import LiberoRgbdEnv
+from ..sim.libero.floors import Floor, read_floors
 from ..sim.libero.tasks import PLACEMENTS
 from ..sim.record import record
 from ..sim.tasks import find_task
@@ -56,6 +57,10 @@ class SimulatedTask(ABC):
     @abstractmethod
     def environment(self, cameras: str, image_size: int, sensor: str = "ideal") -> EnvConfig:
         """LeRobot's configuration of its environment."""
+
+    def floor(self) -> Floor | None:
+        """How often the expert and a plan that never looks succeed, where it was measured beforehand."""
+        return None
 
     @abstractmethod
     def record(
@@ -130,6 +135,9 @@ class LiberoTask(SimulatedTask):
             rendering=self.rendering,
             sensor=sensor,
         )
+
+    def floor(self) -> Floor | None:
+        return read_floors().get((self.suite, self.number, self.placement))
 
     def record(
         self, folder: Path, repo_id: str, episodes: int, cameras: str, image_size: int, seed: int

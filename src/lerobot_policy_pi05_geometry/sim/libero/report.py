@@ -62,10 +62,7 @@ def report(results: list[TaskResult], placement: str) -> str:
         "| task | success | 95 % interval | blind plan | expert |",
         "| --- | --- | --- | --- | --- |",
     ]
-    lines += [
-        _row(f"{r.suite}/{r.index}", r.successes, r.episodes, *_floor_columns(r.floor))
-        for r in results
-    ]
+    lines += [_row(f"{r.suite}/{r.index}", r.successes, r.episodes, *_floor_columns(r.floor)) for r in results]
     for suite in dict.fromkeys(result.suite for result in results):
         own = [result for result in results if result.suite == suite]
         lines.append(_row(f"**{suite}**", sum(r.successes for r in own), sum(r.episodes for r in own), "", ""))
