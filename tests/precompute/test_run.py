@@ -203,6 +203,15 @@ def test_a_store_begun_with_files_of_another_length(whole, dataset):
         prepare(dataset, whole.manifest.encoder, 3, image_size=42, output=whole.folder.parent, shard_frames=8)
 
 
+def test_a_manifest_cannot_send_the_features_elsewhere(whole, dataset, tmp_path):
+    """It comes with the dataset. The store that goes on is the one that was found."""
+    folder = tmp_path / "stores" / "found"
+    shutil.copytree(whole.folder, folder)
+    dataclasses.replace(whole.manifest, key="../../victim").write(folder)
+    again = prepare(dataset, whole.manifest.encoder, 3, image_size=42, output=folder.parent, shard_frames=7)
+    assert again.folder == folder
+
+
 def test_settings_that_cannot_be(dataset, whole, tmp_path):
     encoder = whole.manifest.encoder
     with pytest.raises(ValueError, match="geometry_cameras names back, but the data has RGB images from front, wrist"):

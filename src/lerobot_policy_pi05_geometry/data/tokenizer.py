@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 
 PALIGEMMA_TOKENIZER = "google/paligemma-3b-pt-224"
 _FILES = ("tokenizer.json", "tokenizer_config.json")
+_REPORTED_TASKS = 100  # a server meets tasks without end
 
 
 @ProcessorStepRegistry.register(name="pi05_geometry_tokenizer")
@@ -69,7 +70,7 @@ class PortableTokenizerProcessorStep(TokenizerProcessorStep):
                 f"fits: {prompt!r}; train or convert with a larger --policy.tokenizer_max_length."
             )
         short = task[:kept].rpartition(" ")[0] if " " in task[len(NO_TASK) : kept] else task[:kept]
-        if task not in self._shortened:
+        if task not in self._shortened and len(self._shortened) < _REPORTED_TASKS:
             self._shortened.add(task)
             logger.warning(
                 "A prompt exceeds tokenizer_max_length (%d tokens), so its task is cut to %r; the state stays. Use a shorter "
@@ -85,8 +86,13 @@ class PortableTokenizerProcessorStep(TokenizerProcessorStep):
             with tempfile.TemporaryDirectory() as folder:
                 for name, content in self._files.items():
                     (Path(folder) / name).write_bytes(content)
-                self._built = AutoTokenizer.from_pretrained(folder)
+                self._built = AutoTokenizer.from_pretrained(folder, trust_remote_code=False)
         return self._built
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """The tokenizer's files by name, those that a checkpoint carries."""
+        return dict(self._files)
 
     def get_config(self) -> dict[str, Any]:
         return {**super().get_config(), "tokenizer_name": self.tokenizer_name}
@@ -120,7 +126,7 @@ def read_tokenizer_files(name: str) -> dict[str, bytes]:
                 f"Tokenizer folder {name} is not there; set --policy.tokenizer_path to an existing one."
             )
         try:
-            tokenizer = AutoTokenizer.from_pretrained(local if local.is_dir() else name)
+            tokenizer = AutoTokenizer.from_pretrained(local if local.is_dir() else name, trust_remote_code=False)
         except (OSError, ValueError) as error:
             raise OSError(
                 f"Tokenizer {name} could not be loaded, neither as a folder nor from the hub; PaliGemma's is gated, so "

@@ -124,31 +124,31 @@ def prepare(
         shard_frames=shard_frames,
     )
     stores = root / STORES if output is None else output
-    manifest = _extending(stores, root, manifest) or manifest
-    return Precompute(Frames(dataset, list(keys.values())), source, manifest, stores / manifest.key)
+    folder, manifest = _extending(stores, root, manifest) or (stores / manifest.key, manifest)
+    return Precompute(Frames(dataset, list(keys.values())), source, manifest, folder)
 
 
-def _extending(stores: Path, root: Path, wanted: Manifest) -> Manifest | None:
-    """The store that holds most of the wanted frames, extended to all of them; None if no store can be.
+def _extending(stores: Path, root: Path, wanted: Manifest) -> tuple[Path, Manifest] | None:
+    """Folder and manifest of the store that holds most of the wanted frames, extended to all of them; None if no store can be.
 
     It must have the same recipe, and the dataset must begin with the store's episodes, in files that have not changed.
     """
     begun = [
-        manifest
-        for manifest in stores_in(stores).values()
+        (folder, manifest)  # the folder that was found: a manifest comes with a dataset, and could name another one
+        for folder, manifest in stores_in(stores).items()
         if manifest.recipe == wanted.recipe
         and wanted.episodes.begins_with(manifest.episodes)
         and changed_file(root, manifest.dataset_files, allow_new=True) is None
     ]
     if not begun:
         return None
-    longest = max(begun, key=lambda manifest: manifest.frames)
+    folder, longest = max(begun, key=lambda store: store[1].frames)
     if longest.shard_frames != wanted.shard_frames:
         raise ValueError(
-            f"The store {stores / longest.key} was begun with {longest.shard_frames} frames per file, not "
+            f"The store {folder} was begun with {longest.shard_frames} frames per file, not "
             f"{wanted.shard_frames}; continue with --shard-frames={longest.shard_frames}, or delete it."
         )
-    return longest.extended(wanted.episodes, wanted.dataset_files)
+    return folder, longest.extended(wanted.episodes, wanted.dataset_files)
 
 
 def begin(work: Precompute) -> None:

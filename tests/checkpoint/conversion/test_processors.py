@@ -1,13 +1,14 @@
 """Processors carry over: the same observation becomes the same prompt and state, the same actions come out."""
 
 import json
+import shutil
 
 import pytest
 import torch
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.processor import RelativeActionsProcessorStep
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.checkpoint.conversion import GeometryStart, convert, export
@@ -171,3 +172,35 @@ def test_a_checkpoint_of_an_earlier_version_gets_the_steps(converted):
         steps = json.loads((converted / name).read_text())["steps"]
         assert to_ours(steps) == steps
         assert to_ours(to_lerobot(steps)) == steps
+
+
+@pytest.mark.parametrize(
+    "named", ["../../theirs.safetensors", "/tmp/x.safetensors", "model.safetensors", "notes.txt", 3]
+)
+@pytest.mark.parametrize("kind", ["lerobot", "ours"])
+def test_a_step_whose_file_is_no_file_of_the_checkpoint_is_refused(named, kind, lerobot_source, converted, tmp_path):
+    """A checkpoint from elsewhere could otherwise have any file read, and written beside the output."""
+    source = tmp_path / "a" / "b" / "source"
+    shutil.copytree(lerobot_source if kind == "lerobot" else converted, source)
+    victim = tmp_path / "home" / "theirs.safetensors"
+    victim.parent.mkdir()
+    victim.write_text("mine")
+    (tmp_path / "a" / "theirs.safetensors").write_text("evil")
+    path = source / "policy_preprocessor.json"
+    pipeline = json.loads(path.read_text())
+    next(step for step in pipeline["steps"] if "state_file" in step)["state_file"] = named
+    path.write_text(json.dumps(pipeline))
+    with pytest.raises(ValueError, match="expected the name of a safetensors file in the same folder"):
+        convert(source, tmp_path / "home" / "x" / "output", GeometryStart(grid=2))
+    assert victim.read_text() == "mine"
+
+
+def test_an_export_writes_the_tokenizers_files_only(converted, tmp_path):
+    """Names of tensors come with a checkpoint; as paths they could lead anywhere."""
+    source, outside = tmp_path / "source", tmp_path / "authorized_keys"
+    shutil.copytree(converted, source)
+    (tokenizer,) = source.glob("*tokenizer*.safetensors")
+    save_file({**load_file(tokenizer), str(outside): torch.zeros(3, dtype=torch.uint8)}, tokenizer)
+    with pytest.raises(ValueError, match="A saved tokenizer has the files"):
+        export(source, tmp_path / "output")
+    assert not outside.exists()

@@ -5,6 +5,7 @@ stand where LeRobot's π0.5 has its own: the prompt (which clips the state) and 
 """
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from copy import deepcopy
@@ -12,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 from safetensors.torch import load_file, save_file
 
@@ -29,17 +31,31 @@ TOKENIZER_FOLDER = (
 _THEIR_PROMPT, _THEIR_TOKENIZER = "pi05_prepare_state_tokenizer_processor_step", "tokenizer_processor"
 _OUR_PROMPT, _OUR_TOKENIZER = "pi05_geometry_prompt", "pi05_geometry_tokenizer"
 
+_STATE_FILE = re.compile(r"\w[\w.-]*\.safetensors")
+
 FindFile = Callable[[str], Path]
 
 
 def read_pipeline(path: Path) -> dict[str, Any]:
-    """A saved pipeline. Raises ValueError if it is none."""
+    """A saved pipeline. Raises ValueError if it is none, or if a step's file is not one of its own folder."""
     try:
         pipeline = json.loads(path.read_text())
         [step_name(step) for step in pipeline["steps"]]
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{path} is no processor pipeline: expected a JSON object with named 'steps'.") from error
+    for step in pipeline["steps"]:
+        file = step.get("state_file")
+        if file is not None and not _is_state_file(file):
+            raise ValueError(
+                f"{path} names {file!r} as the file of its step '{step_name(step)}'; expected the name of a safetensors file in "
+                "the same folder, and not the weights."
+            )
     return pipeline
+
+
+def _is_state_file(name: Any) -> bool:
+    """Whether a step's state may be read from, and written to, a file of this name: a path could lead anywhere."""
+    return isinstance(name, str) and _STATE_FILE.fullmatch(name) is not None and name != SAFETENSORS_SINGLE_FILE
 
 
 def processors_from_lerobot(find: FindFile, config: PI05GeometryConfig, tokenizer: str | None, output: Path) -> None:
@@ -80,8 +96,10 @@ def processors_to_lerobot(find: FindFile, output: Path) -> None:
     def tokenize(step: Step) -> Step:
         folder = output / TOKENIZER_FOLDER
         folder.mkdir()
-        for name, content in load_file(find(step["state_file"])).items():
-            (folder / name).write_bytes(content.numpy().tobytes())
+        carried = PortableTokenizerProcessorStep()
+        carried.load_state_dict(load_file(find(step["state_file"])))
+        for name, content in carried.files.items():
+            (folder / name).write_bytes(content)
         settings = {**step["config"], "tokenizer_name": PALIGEMMA_TOKENIZER, "padding": "max_length"}
         return {"registry_name": _THEIR_TOKENIZER, "config": settings}
 
