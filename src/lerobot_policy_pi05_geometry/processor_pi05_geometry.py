@@ -15,7 +15,7 @@ from lerobot.processor import (
 )
 
 from .configuration_pi05_geometry import PI05GeometryConfig
-from .data.normaliser_scale import NormaliserProbeStep, NormaliserScaleStep
+from .data.normaliser_scale import NormaliserProbeStep, NormaliserScaleStep, constant_of
 from .data.prompt import PromptProcessorStep
 from .data.raw_state import RawStateProcessorStep
 from .data.relative_actions import absolute_actions_processor, relative_actions_processor
@@ -55,7 +55,7 @@ def make_pi05_geometry_pre_post_processors(
             ),
             NormaliserProbeStep(),
             steps.normalize,
-            NormaliserScaleStep(),
+            NormaliserScaleStep(constant=constant_of(config.normalization_mapping["STATE"].value)),
             PromptProcessorStep(),
             tokenizer,
             steps.to_device,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.configs import NormalizationMode, PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
@@ -25,7 +25,11 @@ PROBE = (
     2.0**15
 )  # a power of two, so that dividing by it is exact; large, so that the rounding of the mean does not matter
 NO_WIDTH = 5e7  # a scale above it comes from LeRobot's eps of 1e-8 in place of a width
-CONSTANT = -1.0  # what LeRobot's normaliser makes of the constant of a dimension without width
+
+
+def constant_of(mode: str | None) -> float:
+    """What LeRobot's normaliser makes of the constant of a dimension without width, by its mode (NormalizationMode's value)."""
+    return 0.0 if mode == NormalizationMode.MEAN_STD.value else -1.0
 
 
 @ProcessorStepRegistry.register(name="pi05_geometry_normaliser_probe")
@@ -59,7 +63,12 @@ class NormaliserProbeStep(ProcessorStep):
 @ProcessorStepRegistry.register(name="pi05_geometry_normaliser_scale")
 @dataclass
 class NormaliserScaleStep(ProcessorStep):
-    """After the normaliser: takes the probe rows off, settles dimensions without width, and scales the anchor."""
+    """After the normaliser: takes the probe rows off, settles dimensions without width, and scales the anchor.
+
+    constant: of a state dimension without width, see `constant_of`. The default is that of quantiles and of min and max.
+    """
+
+    constant: float = -1.0
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         transition = transition.copy()
@@ -68,7 +77,7 @@ class NormaliserScaleStep(ProcessorStep):
         if state is not None:
             state, scale = _without_probes(state)
             # A value that is no number stays one, so that the prompt step refuses it.
-            observation[OBS_STATE] = state.masked_fill((scale > NO_WIDTH) & state.isfinite(), CONSTANT)
+            observation[OBS_STATE] = state.masked_fill((scale > NO_WIDTH) & state.isfinite(), self.constant)
             transition[TransitionKey.OBSERVATION] = observation
         data = dict(transition.get(TransitionKey.COMPLEMENTARY_DATA) or {})
         if ACTION_ANCHOR in data:
@@ -81,7 +90,7 @@ class NormaliserScaleStep(ProcessorStep):
         return transition
 
     def get_config(self) -> dict[str, Any]:
-        return {}
+        return {"constant": self.constant}
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]

@@ -10,9 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from .rigid import as_matrix
+from .rigid import as_matrix, compose
 
 STREAMS = ("depth", "color")
+FOCAL_LENGTHS = (0.1, 20.0)  # in image sides: from a field of view of 157 degrees to one of 3
+CENTRES = (-1.0, 2.0)  # of the optical axis, in image sides: a cropped image may have it outside
+SQUEEZE = (
+    1.03  # a factor by which images may be wider or higher than the calibration's size says: sizes are whole pixels
+)
 ROTATIONS = (0, 90, 180, 270)  # degrees clockwise, as LeRobot's cameras have it (270 is its -90)
 
 
@@ -95,6 +100,21 @@ class CameraCalibration:
         # Pixel centres are at integers, so the image's corner is at -0.5: that is the point which scales.
         return [fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5]
 
+    def check_view(self, name: str, height: int, width: int) -> None:
+        """Raise ValueError unless images (height, width), turned as recorded, may be this view resized.
+
+        A cropped or turned image has another shape, and intrinsics that no scale tells.
+        """
+        one_pixel = 1 + 1.0 / min(height, width)
+        squeeze = (width * self.size[1]) / (height * self.size[0])
+        if not 1 / max(SQUEEZE, one_pixel) <= squeeze <= max(SQUEEZE, one_pixel):
+            raise ValueError(
+                f"Images of camera '{name}' are {width} x {height}, but its calibration is of {self.size[0]} x {self.size[1]}, "
+                "another shape; give the intrinsics of the mode that was recorded (`pi05-geometry calibrate camera`), and "
+                "'rotation' in the calibration if images were turned. For images that were squeezed, scale fx, cx and fy, cy and "
+                "give their size."
+            )
+
     def as_recorded(self) -> "CameraCalibration":
         """The same camera for images as they were recorded: turned by `rotation`, which is 0 in what is returned.
 
@@ -113,6 +133,13 @@ class CameraCalibration:
                 color=None if turned.color is None else _turned_color(turned.color),
             )
         return replace(turned, rotation=0)
+
+
+def pose_of_images(pose: torch.Tensor, rotation: int) -> torch.Tensor:
+    """The pose (..., 4, 4) of images that were turned by `rotation` degrees clockwise, from the sensor's."""
+    for _ in range(rotation // 90):
+        pose = compose(pose, _SENSOR_T_TURNED.to(pose))
+    return pose
 
 
 # Camera axes of an image turned clockwise by a quarter: its x axis is the sensor's -y, its y axis the sensor's x.
@@ -157,3 +184,10 @@ def _check_intrinsics(intrinsics: list[float], size: list[int], what: str) -> No
         raise ValueError(f"Intrinsics of {what} are singular: fx and fy must be above 0, got {fx} and {fy}.")
     if len(size) != 2 or min(size) < 1:
         raise ValueError(f"Size of {what} must be [width, height] in pixels, got {size}.")
+    for focal, centre, side in zip(intrinsics[:2], intrinsics[2:], size, strict=True):
+        low, high = FOCAL_LENGTHS
+        if not low <= focal / side <= high or not CENTRES[0] <= centre / side <= CENTRES[1]:
+            raise ValueError(
+                f"Intrinsics of {what} are no pixels of an image of {size[0]} x {size[1]}: fx, fy, cx, cy are {intrinsics}; give "
+                "them for that size."
+            )

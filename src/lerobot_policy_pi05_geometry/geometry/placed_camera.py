@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .calibration import Rig
-from .camera import CameraCalibration
+from .camera import CameraCalibration, pose_of_images
 from .depth import LEROBOT_COUNT
 from .keys import RAW_STATE, RIG, batch_like
 from .kinematics import ForwardKinematics
@@ -16,13 +16,17 @@ from .rigid import compose
 class PlacedCamera:
     """A camera and where it stands. rigs: by id; data of one rig has one. size: (H, W) of its images, of depth or of colour.
 
-    `frames` differ in rig only if the data says so (`observation.calibration.rig`); `only` is the rig that a robot is.
+    Frames differ in rig only if the data says so (`observation.calibration.rig`); `only` is the rig of a robot whose observations
+    do not. Raises ValueError for images of another shape than the calibration's.
     """
 
     def __init__(self, name: str, rigs: Mapping[int, Rig], size: tuple[int, int], only: int | None = None) -> None:
         self.name, self.only = name, only
         self.ids = sorted(rigs)
         self.cameras: Sequence[CameraCalibration] = [rigs[number].cameras[name].as_recorded() for number in self.ids]
+        for camera in self.cameras:
+            camera.check_view(name, *size)
+        self._turns = [rigs[number].cameras[name].rotation for number in self.ids]
         self.kinematics = [
             None
             if camera.mount is None
@@ -49,7 +53,7 @@ class PlacedCamera:
         """
         if len(self.ids) == 1:
             return None
-        if self.only is not None:
+        if RIG not in batch and self.only is not None:
             return torch.tensor([self.ids.index(self.only)], device=batch_like(batch).device)
         if RIG not in batch:
             raise ValueError(
@@ -60,9 +64,18 @@ class PlacedCamera:
         return torch.searchsorted(torch.tensor(self.ids, device=batch[RIG].device), batch[RIG].flatten().long())
 
     def check_rigs(self, batch: Mapping[str, Tensor]) -> None:
-        """Raise ValueError for a row whose rig is not known. It looks at values, for which a GPU is waited for."""
-        if len(self.ids) > 1 and self.only is None and RIG in batch:
-            unknown = sorted(set(batch[RIG].flatten().tolist()) - set(self.ids))
+        """Raise ValueError for a row whose rig is not known, or another than `only`.
+
+        It looks at values, for which a GPU is waited for.
+        """
+        if len(self.ids) > 1 and RIG in batch:
+            told = set(batch[RIG].flatten().tolist())
+            if self.only is not None and told != {self.only}:
+                raise ValueError(
+                    f"{RIG} has {', '.join(map(str, sorted(told)))}, but --policy.rig is {self.only}; train on data of several "
+                    "rigs with --policy.rig=null, and act with the rig that the robot is."
+                )
+            unknown = sorted(told - set(self.ids))
             if unknown:
                 raise ValueError(
                     f"{RIG} has {', '.join(map(str, unknown))}, but the calibration has the rigs "
@@ -95,6 +108,16 @@ class PlacedCamera:
             return by_rig[0]
         rows = rows.expand(state.shape[0])
         return torch.stack(by_rig, dim=1)[torch.arange(state.shape[0], device=device), rows]
+
+    def frame_poses(self, pose: Tensor, rows: Tensor | None) -> Tensor:
+        """`base_T_camera` of images as they arrive, from poses of the sensor, (B, 4, 4) or (4, 4), that came with the frames."""
+        if not any(self._turns):
+            return pose
+        by_rig = torch.stack([pose_of_images(pose, turn) for turn in self._turns])  # (R, ..., 4, 4)
+        if rows is None:
+            return by_rig[0]
+        rows = rows.to(pose.device)
+        return by_rig[rows] if pose.ndim == 2 else by_rig[rows.expand(len(pose)), torch.arange(len(pose))]
 
     def _constants(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Intrinsics (R, 4), factors (R,), `base_T_camera` and `link_T_camera` (R, 4, 4), NaN where there is none.

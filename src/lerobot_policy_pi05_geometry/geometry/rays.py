@@ -79,7 +79,7 @@ class RaySource(GeometrySource):
         pose = as_pose(batch[key], key)
         if check:
             check_rigid(pose, key)
-        return pose.to(torch.float32)
+        return self.placed[camera].frame_poses(pose, rows).to(torch.float32)
 
 
 def camera_rays(calibration: CameraCalibration, height: int, width: int, grid: int) -> Tensor:

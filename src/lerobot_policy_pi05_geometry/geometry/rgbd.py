@@ -142,7 +142,7 @@ class RgbdSource(GeometrySource):
         pose = as_pose(batch[key], key)
         if check:
             check_rigid(pose, key)
-        return pose
+        return self.placed[camera].frame_poses(pose, rows)
 
 
 def depth_features(as_points: bool) -> tuple[int, int]:

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 RIGID_TOLERANCE = 1e-3
+FARTHEST = 100.0  # metres from the base: more are millimetres
 
 
 def identity_rows() -> list[list[float]]:
@@ -49,3 +50,5 @@ def check_rigid(pose: Tensor, what: str) -> None:
             f"{what} must be a rigid transform (a rotation matrix with determinant 1, a translation in metres, and the "
             f"last row 0 0 0 1): the error is {error.max().item():.3g}; give base_T_camera with OpenCV axes."
         )
+    if (pose[..., :3, 3].abs() > FARTHEST).any():
+        raise ValueError(f"{what} has a translation of more than {FARTHEST:.0f} m; give metres, not millimetres.")

@@ -95,7 +95,7 @@ def _pose_of(placed: PlacedCamera, batch: Mapping[str, Tensor]) -> Tensor | None
     """`base_T_camera` (4, 4) that comes with the frame, or by the calibration; None if neither tells it."""
     key = extrinsics_key(placed.name)
     if key in batch:
-        return as_pose(batch[key][:1].cpu().float(), key)[0]
+        return placed.frame_poses(as_pose(batch[key][:1].cpu().float(), key), None)[0]
     if not placed.placed or (placed.on_arm and RAW_STATE not in batch):
         return None
     state = {RAW_STATE: batch[RAW_STATE][:1].cpu()} if placed.on_arm else {}

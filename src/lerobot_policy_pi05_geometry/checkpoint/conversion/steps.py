@@ -7,7 +7,7 @@ switch them on.
 
 from typing import Any
 
-from ...data.normaliser_scale import NormaliserProbeStep, NormaliserScaleStep
+from ...data.normaliser_scale import NormaliserProbeStep, NormaliserScaleStep, constant_of
 from ...data.raw_state import RawStateProcessorStep
 from ...data.relative_actions import absolute_actions_processor, relative_actions_processor
 from ...data.state_width import StateWidthStep
@@ -36,7 +36,8 @@ def preprocessor_to_ours(steps: list[Step]) -> list[Step]:
     result = []
     for step in steps:
         if step_name(step) == _NORMALIZER:
-            result += [*map(_saved, [*before, NormaliserProbeStep()]), step, _saved(NormaliserScaleStep())]
+            scale = NormaliserScaleStep(constant=constant_of(step.get("config", {}).get("norm_map", {}).get("STATE")))
+            result += [*map(_saved, [*before, NormaliserProbeStep()]), step, _saved(scale)]
         elif step_name(step) not in (*_OURS_ALONE, RELATIVE):
             result.append(step)
     return result
