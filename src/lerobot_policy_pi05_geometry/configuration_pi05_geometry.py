@@ -179,8 +179,9 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     image_resolution: tuple[int, int] = (224, 224)
     empty_cameras: int = 0
     absent_cameras: list[str] = field(default_factory=list)  # RGB keys that observations may lack
-    # Empty and absent ones, set by validate_features.
+    # Empty and absent ones, and the order of all image tokens, set by validate_features.
     optional_cameras: dict[str, PolicyFeature] = field(default_factory=dict)
+    image_order: list[str] = field(default_factory=list)
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -285,6 +286,9 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
         round, which depth in the data and an empty camera in the policy would both break.
         """
         inputs = dict(self.input_features or {})
+        # A camera that is declared absent later keeps its place among the image tokens.
+        if super().image_features:
+            self.image_order = list(self.image_features)
         for key, feature in list(inputs.items()):
             if is_geometry_key(key, self.depth_keys) and not _is_rgb(key, feature):
                 self.geometry_features[key] = inputs.pop(key)
@@ -350,8 +354,10 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
 
     @property
     def image_features(self) -> dict[str, PolicyFeature]:
-        """RGB cameras, those that may be absent last."""
-        return {**super().image_features, **self.optional_cameras}
+        """RGB cameras in the order of their tokens: that of the data, empty cameras last."""
+        found = {**super().image_features, **self.optional_cameras}
+        known = [key for key in self.image_order if key in found]
+        return {key: found[key] for key in dict.fromkeys([*known, *found])}
 
     def may_be_absent(self, image_key: str) -> bool:
         """Whether observations may lack this RGB camera."""

@@ -106,6 +106,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             self.model.compile_training()
         self.progress = TrainingProgress()
         self._acted_on = 0  # rows of the last observation; 0 before the first
+        self._present: tuple[bool, ...] = ()  # which cameras it had an image of
         self._noise_seed = torch.initial_seed()
         tokens = 0 if self.geometry is None else self.geometry.source.num_tokens
         self.geometry_log = GeometryLog(self.model.paligemma_with_expert, tokens)
@@ -307,13 +308,17 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     # --- acting ---------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Start an episode: the queued actions are dropped, and the next images are checked."""
+        """Start an episode, prepared for: see `start_episode` and `warm_up`."""
+        self.start_episode()
+        if self._acted_on and not self.training:
+            self.warm_up()
+
+    def start_episode(self) -> None:
+        """Drop the queued actions; the next images and poses are checked, and no camera has been seen."""
         self._action_queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
         self.image_range.reset()
         if self.geometry is not None:
             self.geometry.reset()
-        if self._acted_on and not self.training:
-            self.warm_up()
 
     def warm_up(self, batch_size: int | None = None) -> None:
         """Prepare for episodes of so many robots (as many as acted last, at first one): no chunk then waits for a preparation.
@@ -324,7 +329,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         config = self.config
         shapes = ChunkShapes(
             batch=batch_size or self._acted_on or 1,
-            cameras=len(config.image_features),
+            present=self._present or (True,) * len(config.image_features),
             side=config.image_resolution[0],
             geometry_tokens=0 if self.geometry is None else self.geometry.source.num_tokens,
             geometry_width=self.model.geometry_width,
@@ -368,6 +373,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if anchor is not None and kwargs.get("prev_chunk_left_over") is not None:
             kwargs["prev_chunk_left_over"] = relative_to(anchor, kwargs["prev_chunk_left_over"])
         images, img_masks = prepare_images(batch, self.config, self.training_step.device)
+        self._present = tuple(image is not None for image in images)
         geometry = None
         if self.geometry is not None:  # On a GPU it is measured on a stream of its own, beside vision and prefix.
             geometry = PendingGeometry(self.geometry.source.num_tokens, partial(self._measure, batch))

@@ -119,7 +119,7 @@ def arm(
 
     from lerobot_policy_pi05_geometry.dataset_folder import require_dataset
     from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
-    from lerobot_policy_pi05_geometry.robot.calibrate import make_arm, state_names
+    from lerobot_policy_pi05_geometry.robot.calibrate import keep_offsets, make_arm, state_names
     from lerobot_policy_pi05_geometry.robot.link_files import read_links
 
     pairs = [text.partition("=") for text in joint or []]
@@ -132,14 +132,22 @@ def arm(
     if set(flip or []) - set(known):
         raise ValueError(f"--flip names a joint that the state does not have; it has {', '.join(known)}.")
     made.joints = [replace(each, sign=-1 if each.joint in (flip or []) else 1) for each in made.joints]
+    kept = keep_offsets(made, calibration.arms.get(name))
+    mounted = sorted(key for key, each in calibration.cameras.items() if each.mount and each.mount.arm == name)
     calibration.arms[name] = made
     write_calibration_file(file, calibration)
     still = sorted({link.joint for link in made.links if link.joint} - set(known))
     console.print(
         f"{name}: {', '.join(f'{each.joint} = {each.state}' for each in made.joints)}"
         + (f"; not in the state, so always at 0: {', '.join(still)}" if still else "")
+        + (f"; offsets kept from the file: {', '.join(kept)}" if kept else "")
         + f". Wrote [bold]{file}[/bold]."
     )
+    if mounted:
+        console.print(
+            f"{', '.join(mounted)}: placed with the arm as it was in the file before; run pi05-geometry calibrate hand-eye again "
+            "if its links or joints have changed."
+        )
 
 
 @calibrate.command("hand-eye")

@@ -308,3 +308,17 @@ def test_after_a_warm_up_no_prompt_is_recorded_in_an_episode():
         policy.predict_action_chunk(batch | text, noise=noise)
     assert policy.sampler.explain()["CUDA graphs"] == told
     assert torch.equal(policy.predict_action_chunk(batch, noise=noise), before)
+
+
+@pytest.mark.parametrize("changes", [{"empty_cameras": 1}, {"absent_cameras": [WRIST]}])
+def test_a_warm_up_is_for_the_cameras_that_are_there(changes):
+    policy = record(make_policy(tokenizer_max_length=70, **changes))
+    batch, noise = make_batch(1), torch.randn(1, CHUNK, 8)
+    batch = without(batch, WRIST) if "absent_cameras" in changes else batch
+    policy.predict_action_chunk(batch, noise=noise)
+    policy.reset()
+    told = policy.sampler.explain()["CUDA graphs"]
+    for length in (5, 33, 70):
+        text = {TOKENS: torch.full((1, length), 7), TOKEN_MASK: torch.ones(1, length, dtype=torch.bool)}
+        policy.predict_action_chunk(batch | text, noise=noise)
+    assert policy.sampler.explain()["CUDA graphs"] == told

@@ -2,10 +2,12 @@
 
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 
 from lerobot_policy_pi05_geometry.checkpoint.load import LoadedPolicy
 from lerobot_policy_pi05_geometry.inspect.bench import PARTS, STEPS, bench, random_observation
-from tests.entry_points import CHUNK, make_observation, make_policy, make_processors
+from tests.entry_points import CHUNK, make_calibration, make_features, make_observation, make_policy, make_processors
+from tests.serving.running import make_rigs
 
 
 def load(**changes) -> LoadedPolicy:
@@ -68,3 +70,18 @@ def test_no_observation_is_made_up_for_a_checkpoint_without_features():
     config.input_features = {}
     with pytest.raises(ValueError, match=r"names no cameras and no state yet .* give --dataset.root"):
         random_observation(config)
+
+
+@pytest.mark.parametrize("rig", [None, 5])
+def test_a_policy_of_several_rigs_can_be_timed(rig):
+    inputs, _ = make_features()
+    inputs["observation.calibration.rig"] = PolicyFeature(FeatureType.STATE, (1,))
+    loaded = load(calibration={}, rigs=make_rigs(None), input_features=inputs, rig=rig)
+    assert bench(loaded, random_observation(loaded.policy.config), 1).chunk.p50 > 0
+
+
+def test_depth_is_1_m_whatever_its_scale():
+    calibration = make_calibration()
+    calibration["front"].depth_scale = 1e-5
+    loaded = load(calibration=calibration)
+    assert bench(loaded, random_observation(loaded.policy.config), 1).chunk.p50 > 0

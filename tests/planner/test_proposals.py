@@ -60,6 +60,19 @@ def test_a_given_micro_batch_is_not_searched(budget):
     assert isinstance(outcome, Rejection) or "--policy.micro_batch_size=3" in outcome.options()
 
 
+def test_a_given_whole_batch_is_not_divided():
+    """0 is a setting too."""
+    sizes = []
+
+    def predict(rows: int, checkpointing: bool) -> tuple[Load, MemorySplit]:
+        sizes.append(rows)
+        return replace(LOAD, micro_batch_size=rows), MemorySplit(weights=0, activations=rows * 2**30)
+
+    outcome = _largest(RECIPES[0], predict, LOAD, 2**32, Fixed({"micro_batch_size": 0}))
+    assert isinstance(outcome, Rejection)
+    assert set(sizes) == {LOAD.batch_size}
+
+
 def outcomes(budget: int, settings: dict | None = None, load: Load = LOAD, lora_rank: int | None = None):
     """Of the `tiny` policy without geometry; checkpointing is fixed unless a test is about it, for it doubles the runs."""
     fixed = Fixed({"geometry_source": "none", "gradient_checkpointing": True} | (settings or {}), lora_rank)

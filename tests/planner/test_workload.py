@@ -6,11 +6,14 @@ import weakref
 import pytest
 import torch
 
+from lerobot_policy_pi05_geometry.geometry.camera import Mount
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
+from lerobot_policy_pi05_geometry.geometry.kinematics import Arm, Link, StateJoint
+from lerobot_policy_pi05_geometry.geometry.rigid import identity_rows
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from lerobot_policy_pi05_geometry.planner.counting import storage_bytes
 from lerobot_policy_pi05_geometry.planner.workload import FakePolicy, Load
-from tests.entry_points import TOKENS, make_batch, make_config, without
+from tests.entry_points import TOKENS, WRIST_POSE, make_batch, make_calibration, make_config, make_features, without
 from tests.planner.allocations import allocated
 
 PROMPT = make_batch()[TOKENS].shape[1]
@@ -265,3 +268,19 @@ def test_on_a_gpu_within_ten_percent(case):
     what, size, changes = [c for c in GPU_CASES if c[2].get("train_expert_only") or c[0] == "inference"][case]
     measured = measure(what, size, changes, gpu=True)["bytes"]
     assert predict(what, size, changes, gpu=True).total == pytest.approx(measured, rel=0.1)
+
+
+def test_a_depth_camera_on_the_arm_is_planned_for():
+    """Its pose follows from the raw state."""
+    calibration, (inputs, _) = make_calibration(), make_features()
+    arm = Arm([Link("base"), Link("hand", "base", identity_rows(), "revolute", "j")], [StateJoint("j", "j.pos", 0)])
+    calibration["wrist"].mount = Mount("arm", "hand", identity_rows())
+    inputs = without(inputs, WRIST_POSE)
+    for cameras in (["wrist"], ["front", "wrist"]):
+        config = make_config(
+            calibration=calibration, arms={"arm": arm}, input_features=inputs, geometry_cameras=cameras
+        )
+        config.validate_features()
+        policy = FakePolicy(config)
+        assert policy.training(load(2)).activations > 0
+        assert policy.inference(load(2)).activations > 0

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
 from lerobot_policy_pi05_geometry.serving.engine import Job, PolicyEngine, make_job, note_answer
@@ -10,7 +11,7 @@ from lerobot_policy_pi05_geometry.serving.inputs import Inputs
 from lerobot_policy_pi05_geometry.serving.limits import Limits, RequestError
 from lerobot_policy_pi05_geometry.serving.noise import request_noise
 from lerobot_policy_pi05_geometry.serving.session import Session
-from tests.entry_points import ACTION_DIM, CHUNK, WRIST_DEPTH, WRIST_POSE, without
+from tests.entry_points import ACTION_DIM, CHUNK, WRIST_DEPTH, WRIST_POSE, make_calibration, make_features, without
 
 from .running import load, local_chunk, make_request, observation_of
 
@@ -195,3 +196,51 @@ def test_warming_up_runs_every_size_and_leaves_nothing_behind():
     assert isinstance(job, Job)
     _, actions = local_chunk(loaded, [make_request()], job.noise[None])
     np.testing.assert_array_equal(engine.run([job], 1)[0].actions, actions[0].numpy())
+
+
+def test_a_camera_of_rays_whose_pose_is_lost_is_masked_as_it_is_locally():
+    loaded = load(geometry_source="rays")
+    inputs, engine = Inputs(loaded.policy.config, Limits()), PolicyEngine(loaded)
+    request = without(make_request(), "depth")
+    session = Session()
+    engine.run([make_job(session, inputs.read(request), 7, SHAPE)], 1)
+    lost = inputs.read(without(request, "extrinsics"), seen={WRIST_POSE})
+    job = make_job(session, lost, 7, SHAPE)
+    (answer,) = engine.run([job], 1)
+    observation = observation_of(make_request())
+    loaded.policy.reset()
+    loaded.policy.predict_action_chunk(loaded.preprocess(dict(observation)), noise=job.noise[None])
+    local = loaded.policy.predict_action_chunk(
+        loaded.preprocess(without(observation, WRIST_POSE)), noise=job.noise[None]
+    )
+    torch.testing.assert_close(answer.chunk, local[0], atol=1e-5, rtol=0)
+
+
+def test_a_new_episode_computes_one_chunk_and_records_none(monkeypatch):
+    """All robots of a batch wait for what one robot's new episode takes."""
+    loaded = load()
+    engine, chunks = PolicyEngine(loaded), []
+    forward = loaded.policy.sampler.forward
+    monkeypatch.setattr(loaded.policy.sampler, "forward", lambda *a, **k: chunks.append(1) or forward(*a, **k))
+    monkeypatch.setattr(loaded.policy, "warm_up", lambda *_: pytest.fail("an episode of one robot warms up for all"))
+    sessions = [Session(), Session()]
+    for _ in range(2):
+        engine.run(jobs_of(loaded, [make_request(0), make_request(1)], sessions), 2)
+    assert len(chunks) == 2
+
+
+def test_a_depth_camera_of_any_scale_can_be_warmed_up():
+    calibration = make_calibration()
+    calibration["front"].depth_scale = 1e-5
+    loaded = load(calibration=calibration)
+    PolicyEngine(loaded).warm(Inputs(loaded.policy.config, Limits()), (1,))
+
+
+def test_a_colour_camera_is_one_whatever_its_name():
+    """A depth map that was turned into colours stands under a depth camera's name."""
+    name, (inputs, _) = "observation.images.heat_depth", make_features()
+    inputs[name] = PolicyFeature(FeatureType.VISUAL, (3, 20, 20))
+    loaded = load(input_features=inputs)
+    request = make_request() | {name: np.full((20, 20, 3), 40, np.uint8)}
+    (job,) = jobs_of(loaded, [request])
+    assert torch.isfinite(PolicyEngine(loaded).run([job], 1)[0].chunk).all()

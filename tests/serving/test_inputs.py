@@ -167,3 +167,28 @@ def test_real_time_chunking():
         2, 3, 4, 5.0, RTCAttentionSchedule.EXP
     )
     assert make_inputs().read(make_request()).guidance is None
+
+
+def test_an_optional_depth_camera_may_be_missing_from_the_start():
+    """As it may where the policy runs locally."""
+    request = make_request()
+    request["depth"] = without(request["depth"], "front")
+    found = make_inputs(optional_depth_cameras=["front"]).read(request)
+    assert FRONT_DEPTH not in found.observation
+    with pytest.raises(RequestError, match=f"has no {FRONT_DEPTH}"):
+        make_inputs(optional_depth_cameras=["wrist"]).read(request)
+
+
+def test_a_pose_may_come_as_datasets_store_it():
+    request = make_request()
+    expected = make_inputs().read(request).observation[WRIST_POSE]
+    rows = {"wrist": request["extrinsics"]["wrist"].flatten()}
+    np.testing.assert_array_equal(make_inputs().read(request | {"extrinsics": rows}).observation[WRIST_POSE], expected)
+
+
+def test_a_camera_of_rays_whose_pose_is_lost_has_none():
+    request = without(make_request(), "depth")
+    inputs = make_inputs(geometry_source="rays")
+    inputs.read(request)
+    found = inputs.read(without(request, "extrinsics"), seen={WRIST_POSE})
+    assert np.isnan(found.observation[WRIST_POSE]).all()

@@ -17,7 +17,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot_policy_pi05_geometry import PI05GeometryRemoteConfig
 from lerobot_policy_pi05_geometry.checkpoint.load import load_policy
 from lerobot_policy_pi05_geometry.serving.client import RefusedError, ServerLostError
-from lerobot_policy_pi05_geometry.serving.remote.robot_session import RobotSession
+from lerobot_policy_pi05_geometry.serving.remote.robot_session import RobotSession, chunks_of
 from lerobot_policy_pi05_geometry.serving.remote.rows import requests_of
 from tests.entry_points import (
     ACTION_DIM,
@@ -206,6 +206,42 @@ def test_a_refusal_is_the_servers_sentence_and_leaves_the_other_rows_in_order():
         assert torch.equal(chunk[:, 0, 0], state[:, 0])
         with pytest.raises(RefusedError, match=f"has no {FRONT}"):
             policy.predict_action_chunk(without(observation, FRONT))
+
+
+class FakeSession:
+    """answers: one after the other; an exception is raised."""
+
+    def __init__(self, *answers):
+        self.answers, self.taken, self.abandoned = list(answers), 0, False
+
+    def begin(self, request):
+        if isinstance(self.answers[0], KeyboardInterrupt):
+            raise self.answers[0]
+
+    def finish(self):
+        self.taken += 1
+        if isinstance(self.answers[0], BaseException):
+            raise self.answers.pop(0)
+        return self.answers.pop(0)
+
+    def abandon(self):
+        self.abandoned = True
+
+
+@pytest.mark.parametrize("error", [ServerLostError("lost"), RefusedError("refused")])
+def test_whatever_happens_to_one_row_no_row_gets_an_earlier_answer(error):
+    sessions = [FakeSession(torch.zeros(1)), FakeSession(error), FakeSession(torch.ones(1))]
+    with pytest.raises(type(error)):
+        chunks_of(sessions, [{}, {}, {}])
+    assert [session.taken for session in sessions] == [1, 1, 1]
+    assert not any(session.abandoned for session in sessions)
+
+
+def test_an_interrupt_ends_the_sessions_that_were_asked():
+    sessions = [FakeSession(torch.zeros(1)), FakeSession(KeyboardInterrupt()), FakeSession(torch.ones(1))]
+    with pytest.raises(KeyboardInterrupt):
+        chunks_of(sessions, [{}, {}, {}])
+    assert [session.abandoned for session in sessions] == [True, True, False]
 
 
 @pytest.mark.parametrize(("settings", "sentence"), [

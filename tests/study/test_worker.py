@@ -13,17 +13,24 @@ from lerobot_policy_pi05_geometry.study.worker import end_with_parent
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
-def test_a_worker_ends_with_the_process_that_started_it():
-    """Parent and worker are forks; the worker holds the pipe's last writing end, so its end is the pipe's end."""
+@pytest.mark.parametrize("early", [False, True])
+def test_a_worker_ends_with_the_process_that_started_it(early):
+    """Parent and worker are forks; the worker holds the pipe's last writing end, so its end is the pipe's end.
+
+    early: the parent ends before the worker has begun to watch.
+    """
     reading, writing = os.pipe()
     parent = os.fork()
     if parent == 0:
+        started_by = os.getpid()
         if os.fork() == 0:
-            end_with_parent(poll=0.05)
+            if early:
+                time.sleep(0.5)
             os.write(writing, b"started")
+            end_with_parent(started_by, poll=0.05)
             time.sleep(60)
             os._exit(0)
-        time.sleep(0.5)
+        time.sleep(0.1 if early else 0.5)
         os._exit(0)  # without a word to the worker
     os.close(writing)
     assert os.read(reading, 10) == b"started"

@@ -133,6 +133,53 @@ def test_micro_batches_and_checkpointing_change_no_gradient(base):
         torch.testing.assert_close(parts[name], gradient, atol=1e-6, rtol=1e-5)
 
 
+@pytest.mark.parametrize("reduction", ["mean", "none"])
+def test_dropout_of_lora_is_drawn_once_however_often_a_layer_runs(base, reduction):
+    """Checkpointing runs a layer again in the backward pass, and a loss per sample whole micro-batches."""
+    gradients = []
+    for again in (False, True):
+        config = make_config(gradient_checkpointing=again, geometry_dropout=0.0, image_dropout=0.0)
+        config.pretrained_path = base
+        torch.manual_seed(5)  # of the adapters, and of the noise
+        policy = PI05GeometryPolicy.from_pretrained(base, config=config)
+        lora = peft.LoraConfig(
+            r=4, lora_alpha=8, lora_dropout=0.2, init_lora_weights=False, **policy._get_default_peft_targets()
+        )
+        policy = policy.wrap_with_peft(peft_config=lora).train()
+        torch.manual_seed(7)
+        policy.forward(make_batch(2), reduction=reduction)[0].sum().backward()
+        gradients.append({name: p.grad for name, p in policy.named_parameters() if p.grad is not None})
+    whole, again = gradients
+    for name, gradient in whole.items():
+        torch.testing.assert_close(again[name], gradient, atol=1e-6, rtol=1e-4)
+
+
+def test_micro_batches_of_a_loss_per_sample_draw_dropout_once(base):
+    """The gradient is that of the losses that were returned: along it, they change as it says."""
+    config = make_config(micro_batch_size=1, geometry_dropout=0.0, image_dropout=0.0)
+    config.pretrained_path = base
+    policy = PI05GeometryPolicy.from_pretrained(base, config=config)
+    torch.manual_seed(5)
+    lora = peft.LoraConfig(
+        r=4, lora_alpha=8, lora_dropout=0.3, init_lora_weights=False, **policy._get_default_peft_targets()
+    )
+    policy = policy.wrap_with_peft(peft_config=lora).train()
+    parameters = [p for name, p in policy.named_parameters() if p.requires_grad and "lora_" in name]
+
+    def losses() -> torch.Tensor:
+        torch.manual_seed(7)
+        return policy.forward(make_batch(2), reduction="none")[0].double().sum()
+
+    before = losses()
+    gradients = torch.autograd.grad(before, parameters)
+    square = sum(g.double().square().sum() for g in gradients)
+    step = 1e-4 / square.sqrt()
+    with torch.no_grad():
+        for p, g in zip(parameters, gradients, strict=True):
+            p -= step * g
+    assert float((before - losses()) / (step * square)) == pytest.approx(1.0, abs=0.05)
+
+
 def test_lora_from_scratch_is_refused():
     with pytest.raises(ValueError, match="from scratch"):
         make_policy().wrap_with_peft(peft_cli_overrides={"r": 4})

@@ -27,6 +27,7 @@ from draccus.utils import DecodingError
 
 from ..weight_files.files import write_whole
 from .camera import CameraCalibration
+from .keys import RIG
 from .kinematics import Arm, ForwardKinematics
 
 CALIBRATION_FILE = "calibration.json"
@@ -120,6 +121,10 @@ def parse_calibration(content: Any, where: str) -> Calibration:
     rigs = {}
     for name, entry in _object(content.get("rigs", {}), where, "rigs").items():
         told = f"Rig '{name}' of {where}"
+        if not name.isdecimal():
+            raise ValueError(
+                f"{told}: rigs are numbered, as the data's {RIG} has them; give a whole number as its name."
+            )
         if not isinstance(entry, dict) or not {"cameras"} <= set(entry) <= {"cameras", "arms"}:
             raise ValueError(f"{told} must be an object with the entries 'cameras' and 'arms'.")
         rigs[name] = Rig(*_parse_rig(entry, told))

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -195,9 +196,9 @@ class _Constants:
         self.wanted = [numbers[name] for name in kinematics.links]
         self.root, self.eye = tensor(arm.base_T_root), tensor(identity_rows())
         self.origins = tensor([link.origin for link in order])
-        turning = [_cross(link.axis) if link.kind == "revolute" else torch.zeros(4, 4).double() for link in order]
-        self.k = tensor([matrix.tolist() for matrix in turning])
-        self.kk = tensor([(matrix @ matrix).tolist() for matrix in turning])
+        # numpy: the planner builds this where tensors have no values.
+        turning = np.stack([_cross(link.axis) if link.kind == "revolute" else np.zeros((4, 4)) for link in order])
+        self.k, self.kk = tensor(turning.tolist()), tensor((turning @ turning).tolist())
         self.slide = torch.zeros(len(order), 4, 4, device=device, dtype=dtype)
         for number, link in enumerate(order):
             if link.kind == "prismatic":
@@ -217,6 +218,6 @@ class _Constants:
         self.known = tensor([0.0 if joint is None else 1.0 for joint in known])
 
 
-def _cross(axis: Sequence[float]) -> Tensor:
+def _cross(axis: Sequence[float]) -> np.ndarray:
     x, y, z = axis
-    return torch.tensor([[0, -z, y, 0], [z, 0, -x, 0], [-y, x, 0, 0], [0, 0, 0, 0]], dtype=torch.float64)
+    return np.array([[0, -z, y, 0], [z, 0, -x, 0], [-y, x, 0, 0], [0, 0, 0, 0]], dtype=np.float64)

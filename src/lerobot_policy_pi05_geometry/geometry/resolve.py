@@ -3,6 +3,7 @@
 `resolve` reads the configuration and never changes it. The policy writes what it returns back once, with `config.record`.
 """
 
+import logging
 from collections.abc import Mapping
 from copy import copy
 from functools import partial
@@ -14,6 +15,7 @@ from .da3 import Da3Encoder, Da3Source
 from .da3.weights import load_da3
 from .dataset_calibration import read_dataset_calibration
 from .dataset_depth import check_depth_scale, codec_bounds
+from .depth import LEROBOT_COUNT
 from .feature_store import FeatureStoreSource
 from .feature_store.match import open_store
 from .keys import camera_of, extrinsics_key
@@ -28,6 +30,8 @@ from .with_rays import WithRays
 
 if TYPE_CHECKING:
     from ..configuration_pi05_geometry import PI05GeometryConfig
+
+logger = logging.getLogger(__name__)
 
 
 FROM_RGB = ("da3", "features", "rays")  # sources with one view per RGB camera
@@ -257,7 +261,22 @@ def resolve_calibration(config: "PI05GeometryConfig", dataset_meta: Any | None) 
             f"The calibration of the dataset at {dataset_meta.root} differs from the one recorded in the checkpoint; say "
             "which holds with --policy.calibration_path."
         )
+    if known and found and recorded != of_dataset:
+        logger.warning(
+            "The dataset at %s carries another calibration than the one that was given to this policy, which is kept; give the "
+            "dataset's with --policy.calibration_path if the cameras have moved.", dataset_meta.root,
+        )  # fmt: skip
     return recorded if known else of_dataset
+
+
+def one_metre(config: "PI05GeometryConfig", camera: str, rig: int | None = None) -> float:
+    """Depth of 1 m as it arrives from a camera: in the declared unit, and counted as its calibration says.
+
+    rig: of a policy of several rigs.
+    """
+    cameras = config.calibration if rig is None or not config.rigs else config.rigs[str(rig)].cameras
+    scale = cameras[camera].depth_scale if camera in cameras else None
+    return (1000.0 if config.depth_unit == "mm" else 1.0) * (1.0 if scale is None else LEROBOT_COUNT / scale)
 
 
 def choose_rigs(config: "PI05GeometryConfig", calibration: Calibration) -> dict[int, Rig]:

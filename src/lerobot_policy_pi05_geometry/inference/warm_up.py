@@ -16,12 +16,12 @@ from .side_stream import PendingGeometry
 
 
 class ChunkShapes(NamedTuple):
-    """Shapes of a chunk's inputs: images (batch, 3, side, side) of so many cameras, geometry (batch, tokens, width),
+    """Shapes of a chunk's inputs: images (batch, 3, side, side) of the cameras that are present, geometry (batch, tokens, width),
     prompts of at most longest_prompt tokens, noise (batch, steps, action_dim). geometry_tokens: 0 without geometry.
     """
 
     batch: int
-    cameras: int
+    present: tuple[bool, ...]
     side: int
     geometry_tokens: int
     geometry_width: int
@@ -41,10 +41,11 @@ def warm_up(sampler: ChunkSampler, runner: RunnerName, shapes: ChunkShapes, devi
         embs = torch.zeros(batch, shapes.geometry_tokens, shapes.geometry_width, device=device)
         blank = GeometryTokens(embs, torch.zeros(batch, shapes.geometry_tokens, dtype=torch.bool, device=device))
         geometry = PendingGeometry(shapes.geometry_tokens, lambda: blank)
-    images = [torch.zeros(batch, 3, shapes.side, shapes.side, device=device) for _ in range(shapes.cameras)]
-    present = [torch.ones(batch, dtype=torch.bool, device=device) for _ in images]
+    image = torch.zeros(batch, 3, shapes.side, shapes.side, device=device)
+    images = [image if there else None for there in shapes.present]
+    masks = [torch.full((batch,), there, device=device) for there in shapes.present]
     noise = torch.zeros(batch, shapes.steps, shapes.action_dim, device=device)
     for length in range(PROMPT_STEP, shapes.longest_prompt + PROMPT_STEP, PROMPT_STEP):
         text = torch.zeros(batch, length, dtype=torch.int64, device=device)
         mask = torch.ones_like(text, dtype=torch.bool)
-        sampler(images, present, text, mask, noise=noise, geometry=geometry, runner=runner)
+        sampler(images, masks, text, mask, noise=noise, geometry=geometry, runner=runner)

@@ -14,7 +14,15 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from ..checkpoint.load import LoadedPolicy
 from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..data.images import prepare_images
-from ..geometry.keys import CALIBRATION_PREFIX, extrinsics_key, find_depth_key, is_depth_key
+from ..geometry.keys import (
+    CALIBRATION_PREFIX,
+    RIG,
+    depth_camera_name,
+    extrinsics_key,
+    find_depth_key,
+    is_depth_key,
+)
+from ..geometry.resolve import one_metre
 from ..inference.runner import ChunkRunner, ChunkSettings, Observation
 from ..model.segments import GeometryTokens
 
@@ -59,12 +67,16 @@ def random_observation(config: PI05GeometryConfig, task: str = "do the task") ->
         )
     random = torch.Generator().manual_seed(0)
     observation: dict[str, Any] = {"task": [task]}
+    rig = config.rig if config.rig is not None else next(iter(sorted(map(int, config.rigs))), None)
     for key, feature in {**(config.input_features or {}), **config.geometry_features}.items():
         shape = (1, *feature.shape)
-        if key.startswith(CALIBRATION_PREFIX):
+        if key == RIG:
+            observation[key] = torch.tensor([[rig or 0]])
+        elif key.startswith(CALIBRATION_PREFIX):
             observation[key] = torch.eye(4)[None]
         elif is_depth_key(key, config.depth_keys) and key in config.geometry_features:
-            observation[key] = torch.full(shape, 1000.0 if config.depth_unit == "mm" else 1.0)
+            camera = next((name for name, own in config.depth_keys.items() if own == key), depth_camera_name(key))
+            observation[key] = torch.full(shape, one_metre(config, camera, rig))
         elif feature.type is FeatureType.VISUAL:
             observation[key] = torch.rand(shape, generator=random)
         elif key == OBS_STATE:

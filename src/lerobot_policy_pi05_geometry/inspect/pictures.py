@@ -1,5 +1,6 @@
 """Figures. Each function returns a matplotlib figure of measured values."""
 
+import math
 from collections.abc import Mapping
 
 import matplotlib
@@ -61,7 +62,12 @@ def depth_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Fig
         key = find_depth_key(camera, batch, policy.config.depth_keys)
         if key is not None:
             raw = batch[key][:1].cpu()
-            depth, valid = to_metres(raw, camera, policy.config.depth_unit, size, policy.config.max_depth)
+            placed = source.placed[camera]
+            factor = placed.depth_factor(placed.rows({name: value[:1] for name, value in batch.items()}), raw.device)
+            bounds = source.bounds.get(camera, (0.0, math.inf))
+            depth, valid = to_metres(
+                raw, camera, policy.config.depth_unit, size, policy.config.max_depth, factor, bounds
+            )
             shown[:] = np.where(valid[0, 0].numpy(), depth[0, 0].numpy(), np.nan)
         if rgb is not None:
             row[0].imshow(rgb)

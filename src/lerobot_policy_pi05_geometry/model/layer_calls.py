@@ -29,8 +29,13 @@ def call_layer(layer: nn.Module, *arguments: Any, checkpointing: bool = False, c
     if compiled and torch.is_grad_enabled() and not _has_hooks(layer):
         call = _call_compiled
     if checkpointing:
-        return checkpoint(call, layer, *arguments, use_reentrant=False, preserve_rng_state=False)
+        return checkpoint(call, layer, *arguments, use_reentrant=False, preserve_rng_state=draws(layer))
     return call(layer, *arguments)
+
+
+def draws(module: nn.Module) -> bool:
+    """Whether a module draws random numbers when it is called, as LoRA's dropout does: run again, it must draw the same."""
+    return any(isinstance(part, nn.Dropout) and part.p > 0 and part.training for part in module.modules())
 
 
 def _call(layer: nn.Module, *arguments: Any) -> Any:

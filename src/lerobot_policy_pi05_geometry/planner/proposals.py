@@ -161,7 +161,7 @@ def _largest(
             return Proposal(recipe, checkpointing is not False, asked, split, fixed)
         # Activations grow linearly with the batch, from an offset, so this guess is rarely too small.
         spare = budget - needed(replace(split, activations=0))
-        if split.activations == 0 or (spare <= 0 and rows == 1) or fixed.settings.get("micro_batch_size"):
+        if split.activations == 0 or (spare <= 0 and rows == 1) or "micro_batch_size" in fixed.settings:
             break
         guess = max(1, int(rows * max(spare, 0) / (needed(split) - needed(replace(split, activations=0)))))
         rows = min(rows - 1, guess)

@@ -13,13 +13,14 @@ from typing import NamedTuple
 
 import torch
 from accelerate import init_empty_weights
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 from torch._subclasses import FakeTensorMode
 
 from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..geometry.da3 import Da3Backbone, Da3Encoder, Da3Source, Da3Variant
 from ..geometry.da3.encoder import store_products_in
-from ..geometry.keys import is_geometry_key
+from ..geometry.keys import RAW_STATE, is_geometry_key
 from ..geometry.with_rays import WithRays
 from ..model.precision import DTYPES
 from ..training.micro_batches import rows_of, sum_of
@@ -211,6 +212,8 @@ class FakePolicy:
         observed |= {key: feature.shape for key, feature in config.geometry_features.items()}
         observed |= {key: feature.shape for key, feature in config.input_features.items() if not is_geometry_key(key)}
         batch = {key: torch.zeros(size, *shape) for key, shape in observed.items()}
+        if OBS_STATE in batch:  # forward kinematics of a camera on the arm reads it
+            batch[RAW_STATE] = batch[OBS_STATE]
         batch["observation.language.tokens"] = torch.zeros(size, prompt_tokens, dtype=torch.int64)
         batch["observation.language.attention_mask"] = torch.ones(size, prompt_tokens, dtype=torch.bool)
         batch["action"] = torch.zeros(size, config.chunk_size, config.action_feature.shape[0])

@@ -58,6 +58,23 @@ def make_arm(links: list[Link], names: list[str], given: dict[str, str] | None =
     return arm
 
 
+def keep_offsets(made: Arm, before: Arm | None) -> list[str]:
+    """Give an arm the joint offsets of the one before it, where link file, sign and state entry of a joint are the same.
+
+    Returns the joints whose offset is not 0.
+    """
+    if before is None or made.links != before.links:
+        return []
+    known = {joint.joint: joint for joint in before.joints}
+    made.joints = [
+        replace(joint, offset=known[joint.joint].offset)
+        if joint.joint in known and replace(known[joint.joint], offset=joint.offset) == joint
+        else joint
+        for joint in made.joints
+    ]
+    return [joint.joint for joint in made.joints if joint.offset]
+
+
 def state_names(dataset: LeRobotDataset) -> list[str]:
     """Names of the state's entries. Raises ValueError if the dataset does not say them."""
     names = dataset.meta.features[OBS_STATE].get("names")

@@ -73,7 +73,11 @@ class PolicyClient:
         except TimeoutError as error:
             self.close()  # so that the late answer is never taken for another request's
             raise ServerLostError(f"{self._url} has not answered within {self._timeout:g} s.") from error
-        except (ConnectionClosed, OSError) as error:
+        except ConnectionClosed as error:
+            self.close()
+            why = "" if error.rcvd is None else error.rcvd.reason
+            raise ServerLostError(f"The connection to {self._url} broke{': ' + why if why else '.'}") from error
+        except OSError as error:
             self.close()
             raise ServerLostError(f"The connection to {self._url} broke.") from error
         if isinstance(frame, str):

@@ -11,7 +11,9 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from torch import Tensor
 
 from ..checkpoint.load import LoadedPolicy
-from ..geometry.keys import CALIBRATION_PREFIX, RIG, is_geometry_key
+from ..configuration_pi05_geometry import PI05GeometryConfig
+from ..geometry.keys import CALIBRATION_PREFIX, DEPTH_SUFFIX, RIG, camera_of, is_geometry_key
+from ..geometry.resolve import one_metre
 from .inputs import Guidance, Inputs, Request
 from .limits import RequestError
 from .noise import request_noise
@@ -99,7 +101,7 @@ class PolicyEngine:
         start = time.perf_counter()
         filled = [*jobs, *[jobs[-1]] * (size - len(jobs))]
         if any(job.begins for job in jobs):
-            self.policy.reset()  # values of observations are looked into at the start of an episode
+            self.policy.start_episode()  # values of observations are looked into then
         with torch.no_grad():  # real-time chunking differentiates, which inference mode forbids
             batch = self._preprocess(collate([job.request for job in filled]))
             noise = torch.stack([job.noise for job in filled]).to(self.config.device)
@@ -118,9 +120,9 @@ class PolicyEngine:
         for size in sizes:
             for words in (1, 6):
                 rig = next(iter(inputs.rigs.ids), None)
-                request = Request(_blank(inputs, self.config.depth_unit), "warm up " * words, None, None, rig)
+                request = Request(_blank(inputs, self.config, rig), "warm up " * words, None, None, rig)
                 self.run([Job(request, torch.zeros(self.noise_shape), begins=True)], size)
-        self.policy.reset()
+        self.policy.start_episode()
 
     @contextmanager
     def _guided(self, jobs: Sequence[Job]) -> Iterator[dict[str, Any]]:
@@ -161,7 +163,7 @@ def collate(requests: Sequence[Request]) -> dict[str, Any]:
         arrays = torch.from_numpy(np.stack([request.observation[key] for request in requests]))
         if key.startswith(CALIBRATION_PREFIX) or arrays.ndim < 3:
             batch[key] = arrays
-        elif is_geometry_key(key):
+        elif arrays.ndim == 3:  # depth (B, H, W); an image has colours, whatever its name
             batch[key] = arrays[:, None]
         else:
             images = arrays.float() / 255 if arrays.dtype == torch.uint8 else arrays
@@ -169,14 +171,15 @@ def collate(requests: Sequence[Request]) -> dict[str, Any]:
     return batch
 
 
-def _blank(inputs: Inputs, depth_unit: str) -> dict[str, np.ndarray]:
+def _blank(inputs: Inputs, config: PI05GeometryConfig, rig: int | None) -> dict[str, np.ndarray]:
     """An observation with every key: grey images, a wall 1 m away, cameras at the origin."""
     observation = {}
     for key, entry in inputs.expected.items():
         if key.startswith(CALIBRATION_PREFIX):
             observation[key] = np.eye(4, dtype=np.float32)
-        elif is_geometry_key(key):
-            observation[key] = np.full(entry.shape, 1000 if depth_unit == "mm" else 1, dtype=np.float32)
+        elif len(entry.shape) == 2:
+            metre = one_metre(config, camera_of(key).removesuffix(DEPTH_SUFFIX), rig)
+            observation[key] = np.full(entry.shape, metre, dtype=np.float32)
         elif len(entry.shape) == 3:
             size = inputs.trained_size[key]
             observation[key] = np.full((*size, 3), 127, dtype=np.uint8)

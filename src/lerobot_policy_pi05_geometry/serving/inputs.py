@@ -28,6 +28,7 @@ from .rigs import Rigs
 
 _EXTRINSICS = ".extrinsics"
 _FLOATS = ("<f4", "<f8")
+_POSE = (4, 4)
 _IMAGE = (0, 0, 3)  # any height and width
 _NESTED = ("images", "depth", "extrinsics")
 _TASKS = ("prompt", "task")
@@ -139,11 +140,15 @@ class Inputs:
         for key, entry in self.expected.items():
             if not entry.required or key in observation:
                 continue
-            if not is_geometry_key(key) or key not in seen:
+            if entry.shape == _IMAGE or not is_geometry_key(key) or key not in seen:
                 raise RequestError(f"The request has no {key}; expected {_describe(entry)}.")
             if key.startswith(CALIBRATION_PREFIX):
-                observation[key] = np.eye(4, dtype=np.float32)
-                key = depth_key(key.removeprefix(CALIBRATION_PREFIX).removesuffix(".extrinsics"))
+                depth = depth_key(key.removeprefix(CALIBRATION_PREFIX).removesuffix(_EXTRINSICS))
+                known = depth in self.expected  # camera rays have none: with a pose of NaN they are masked
+                observation[key] = np.eye(4, dtype=np.float32) if known else np.full((4, 4), np.nan, dtype=np.float32)
+                if not known:
+                    continue
+                key = depth
             observation[key] = np.zeros(self.expected[key].shape, dtype=np.float32)
 
     def key_of(self, name: str) -> str | None:
@@ -156,6 +161,8 @@ class Inputs:
         if value.dtype.str not in entry.dtypes:
             raise RequestError(f"{name} has dtype {value.dtype.str}; expected {_describe(entry)}.")
         value = _without_channel(value, entry)
+        if entry.shape == _POSE and value.shape == (16,):  # as datasets store it, row by row
+            value = value.reshape(_POSE)
         fits = value.ndim == len(entry.shape) and all(
             want in (0, got) for got, want in zip(value.shape, entry.shape, strict=True)
         )
@@ -225,8 +232,9 @@ def _expected(config: PI05GeometryConfig) -> Iterable[Input]:
             yield Input(key, _IMAGE, ("|u1", "<f4"), unit, not config.may_be_absent(key))
     if config.geometry_source == "rgbd":
         for camera, size in config.depth_cameras().items():
-            yield Input(depth_key(camera), size, ("<u2", "<f4"), config.depth_unit, True)
-            yield _pose(config, camera, config.geometry_frame == "base")
+            required = camera not in config.optional_depth_cameras
+            yield Input(depth_key(camera), size, ("<u2", "<f4"), config.depth_unit, required)
+            yield _pose(config, camera, required and config.geometry_frame == "base")
     elif config.geometry_source not in ("none", "random"):  # rays need a pose, too
         for key in config.geometry_features:
             if key.startswith(CALIBRATION_PREFIX) and key.endswith(_EXTRINSICS):
@@ -241,7 +249,7 @@ def _pose(config: PI05GeometryConfig, camera: str, needed: bool) -> Input:
     rigs = [rig.cameras for rig in config.rigs.values()] or [config.calibration]
     placed = all(_is_placed(cameras.get(camera)) for cameras in rigs)
     unit = "base_T_camera in metres, OpenCV axes"
-    return Input(extrinsics_key(camera), (4, 4), _FLOATS, unit, needed and not placed)
+    return Input(extrinsics_key(camera), _POSE, _FLOATS, unit, needed and not placed)
 
 
 def _is_placed(camera: CameraCalibration | None) -> bool:

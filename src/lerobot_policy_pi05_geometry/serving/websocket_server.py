@@ -14,12 +14,13 @@ from typing import Any
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 
 from .admission import Admission
 from .bounded_connection import BoundedConnection
 from .engine import make_job, note_answer
 from .inputs import Inputs
-from .limits import Limits, RequestError
+from .limits import BusyError, Limits, RequestError
 from .session import Session
 from .wire import decode, encode
 from .worker import BatchWorker
@@ -133,7 +134,12 @@ class WebsocketServer:
             start = time.perf_counter()
             self._answering += 1
             try:
-                reply = await self._reply(connection, session, frame)
+                try:
+                    reply = await self._reply(connection, session, frame)
+                except BusyError as error:  # another attempt may succeed: the client connects again
+                    logger.info("Session %s: %s", session.name, error)
+                    await connection.close(CloseCode.TRY_AGAIN_LATER, str(error))
+                    return
                 if isinstance(reply, dict) and previous is not None and "server_timing" in reply:
                     reply["server_timing"]["prev_total_ms"] = previous
                 await connection.send(encode(reply) if isinstance(reply, dict) else reply)
@@ -142,12 +148,15 @@ class WebsocketServer:
             previous = (time.perf_counter() - start) * 1e3
 
     async def _reply(self, connection: ServerConnection, session: Session, frame: str | bytes) -> dict[str, Any] | str:
-        """What is sent back: a map, or a text, which is how this protocol says that something is wrong."""
+        """What is sent back: a map, or a text, which is how this protocol says that something is wrong.
+
+        Raises BusyError if the server takes no request now.
+        """
         try:
             if isinstance(frame, str):
                 raise RequestError("Requests are msgpack maps in binary frames; this was a text frame.")
             if self._draining:
-                raise RequestError("The server is shutting down.")
+                raise BusyError("The server is shutting down.")
             message = decode(frame, self._limits)
             endpoint = message.pop("endpoint", "infer")
             if endpoint == "reset":
@@ -157,11 +166,11 @@ class WebsocketServer:
             if endpoint != "infer":
                 raise RequestError("endpoint must be infer or reset.")
             return await self._infer(connection, session, message)
+        except (BusyError, ConnectionClosed):
+            raise
         except RequestError as error:
             logger.info("Session %s: %s", session.name, error)
             return str(error)
-        except ConnectionClosed:
-            raise
         except Exception:  # what went wrong is for the log; the client is told where to look
             number = secrets.token_hex(4)
             logger.exception("Error %s in session %s.", number, session.name)

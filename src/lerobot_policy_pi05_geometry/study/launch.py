@@ -137,7 +137,8 @@ def _start(run: Run, threads: int) -> Job:
         environment.pop(name, None)  # with these set, accelerate would wait for the other ranks
     with run.log.open("a") as log:
         position = log.tell()
-        command = [sys.executable, "-m", "lerobot_policy_pi05_geometry.study.worker", str(description)]
+        worker = "lerobot_policy_pi05_geometry.study.worker"
+        command = [sys.executable, "-m", worker, str(description), str(os.getpid())]
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
     return Job(run, process, position, TrainingCurve(run.log_every))
 

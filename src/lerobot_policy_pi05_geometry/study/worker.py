@@ -1,8 +1,9 @@
 """Executes one run: prepare, train, evaluate. Finished parts are kept.
 
-It is a separate process, so that a crash affects one run only: `python -m lerobot_policy_pi05_geometry.study.worker RUN`,
-where RUN is a file with the run as JSON. Killed at any time and started again, it gives the same result: each part is written
-completely or not at all, and training restarts from the same seed. A lock keeps two processes from executing the same run.
+It is a separate process, so that a crash affects one run only: `python -m lerobot_policy_pi05_geometry.study.worker RUN PARENT`,
+where RUN is a file with the run as JSON, and PARENT the number of the process that started it. Killed at any time and started
+again, it gives the same result: each part is written completely or not at all, and training restarts from the same seed. A lock
+keeps two processes from executing the same run.
 """
 
 import json
@@ -42,12 +43,11 @@ def execute(run: Run) -> None:
             run.evaluate(condition, _log_progress)
 
 
-def end_with_parent(poll: float = 1.0) -> None:
-    """End this process when the one that started it has ended, however it did: nobody else would end a run then.
+def end_with_parent(parent: int, poll: float = 1.0) -> None:
+    """End this process when the one that started it (its number) has ended, however it did: nobody else would end a run then.
 
     poll: seconds between two looks.
     """
-    parent = os.getppid()
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -63,6 +63,6 @@ def _log_progress(stage: str, done: int, total: int) -> None:
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    end_with_parent()
+    end_with_parent(int(sys.argv[2]))
     content = json.loads(Path(sys.argv[1]).read_text())
     execute(_KINDS[content["kind"]](content))

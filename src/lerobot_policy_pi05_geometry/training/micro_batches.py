@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from ..geometry.keys import CALIBRATION_PREFIX
+from ..model.layer_calls import draws
 from .sharding import require_whole_parameters
 
 Part = Callable[[], Tensor]  # computes the loss of one micro-batch, with its graph
@@ -31,11 +32,32 @@ def in_micro_batches(
     if len(parts) == 1:
         return parts[0]()
     parameters = [p for p in policy.parameters() if p.requires_grad]
+    if reduction == "none" and draws(policy):
+        parts = [_SameDraws(run) for run in parts]
     if torch.is_grad_enabled() and parameters:
         require_whole_parameters(policy, "micro_batch_size")
         return (each_of if reduction == "none" else sum_of)(parts, parameters)
     losses = [run() for run in parts]
     return torch.cat(losses) if reduction == "none" else torch.stack(losses).sum()
+
+
+class _SameDraws:
+    """A part that draws in its second run, in the backward pass, what it drew in its first one."""
+
+    def __init__(self, run: Part) -> None:
+        self._run = run
+        self._state: tuple[Tensor, list[Tensor]] | None = None
+
+    def __call__(self) -> Tensor:
+        gpu = torch.cuda.is_initialized()
+        if self._state is None:
+            self._state = torch.get_rng_state(), torch.cuda.get_rng_state_all() if gpu else []
+            return self._run()
+        with torch.random.fork_rng(range(torch.cuda.device_count()) if gpu else []):
+            torch.set_rng_state(self._state[0])
+            if self._state[1]:
+                torch.cuda.set_rng_state_all(self._state[1])
+            return self._run()
 
 
 def sum_of(parts: Sequence[Part], parameters: Sequence[nn.Parameter]) -> Tensor:

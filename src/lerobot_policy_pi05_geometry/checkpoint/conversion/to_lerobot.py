@@ -2,6 +2,8 @@
 
 import json
 import logging
+from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +43,8 @@ def export(source: str | Path, output: Path, **hub: Any) -> None:
             "LeRobot builds the released sizes only, so it will not load this checkpoint of paligemma_variant=%s.",
             config.paligemma_variant,
         )
-    with init_empty_weights(include_buffers=False):
-        policy = PI05GeometryPolicy(config)
+    with init_empty_weights(include_buffers=False):  # without geometry: neither its weights nor its encoder are needed
+        policy = PI05GeometryPolicy(replace(deepcopy(config), geometry_source="none"))
     stored = {name: tensor for name, tensor in read_tensors(file).items() if not is_new(name)}
     check_weights(file, inherited_shapes(policy), stored)
     embedding = stored[PREFIX + EMBEDDING]

@@ -85,6 +85,7 @@ def read_pickle(message: bytes, limits: Limits) -> Any:
         TypeError,
         KeyError,
         OverflowError,
+        RuntimeError,
     ) as error:  # opcodes that fit nothing before them
         raise PickleRefusedError("The message is no pickle as a robot_client writes it.") from error
     return found

@@ -22,11 +22,11 @@ from ..extras import require_extra
 
 require_extra("serve", "websockets", "msgpack")
 
-from ..client import PolicyClient, RefusedError  # noqa: E402
+from ..client import PolicyClient  # noqa: E402
 from ..keys import read_key  # noqa: E402
 from ..limits import PROTOCOL  # noqa: E402
 from .configuration_pi05_geometry_remote import NO_TRAINING, PI05GeometryRemoteConfig  # noqa: E402
-from .robot_session import RobotSession  # noqa: E402
+from .robot_session import RobotSession, chunks_of  # noqa: E402
 from .rows import requests_of  # noqa: E402
 
 
@@ -133,17 +133,7 @@ class PI05GeometryRemotePolicy(PreTrainedPolicy):
                 request["noise"] = noise[row].float().cpu().numpy()
             request.update(self._guidance(session, row, **kwargs))
             request.update(self._rig(batch, row))
-            session.begin(request)
-        chunks: list[Tensor] = []
-        refused: RefusedError | None = None
-        for session in sessions:  # every answer is taken, or the next request would get this one's
-            try:
-                chunks.append(session.finish())
-            except RefusedError as error:
-                refused = error
-        if refused is not None:
-            raise refused
-        return torch.stack(chunks).to(self.config.device)
+        return torch.stack(chunks_of(sessions, requests)).to(self.config.device)
 
     def _rig(self, batch: dict[str, Any], row: int) -> dict[str, int]:
         """Which rig a row's robot is, as the configuration or else the batch says; nothing if the server need not know."""

@@ -2,13 +2,13 @@
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..client import PolicyClient, ServerLostError
+from ..client import PolicyClient, RefusedError, ServerLostError
 from ..inputs import GUIDANCE_KEYS
 
 logger = logging.getLogger(__name__)
@@ -92,8 +92,38 @@ class RobotSession:
         if self._client is not None:
             self._client.close()
 
+    def abandon(self) -> None:
+        """End the session with whatever it still has to answer; the next request begins a new one."""
+        self.close()
+        self._client = self._last = None
+
     def _lose(self, error: ServerLostError) -> None:
         logger.warning("%s A new session begins.", error)
-        if self._client is not None:
-            self._client.close()
-        self._client = self._last = None
+        self.abandon()
+
+
+def chunks_of(sessions: Sequence[RobotSession], requests: Sequence[dict[str, Any]]) -> list[Tensor]:
+    """The chunk of every request, each in its session. Every answer is taken, or the next request would get this one's.
+
+    Raises the first error of a session after all have answered. Anything else that ends this, such as an interrupt, ends the
+    sessions that were asked.
+    """
+    chunks: list[Tensor] = []
+    failed: Exception | None = None
+    asked: list[RobotSession] = []
+    try:
+        for session, request in zip(sessions, requests, strict=True):
+            asked.append(session)
+            session.begin(request)
+        for session in sessions:
+            try:
+                chunks.append(session.finish())
+            except (RefusedError, ServerLostError) as error:
+                failed = failed or error
+    except BaseException:
+        for session in asked:
+            session.abandon()
+        raise
+    if failed is not None:
+        raise failed
+    return chunks

@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from ...geometry.keys import CALIBRATION_PREFIX, is_geometry_key
+from ...geometry.point_map import as_pose
 
 
 def requests_of(batch: Mapping[str, Any], inputs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Requests with what the server expects of this batch.
 
-    batch: images (B, 3, H, W) or (B, H, W, 3), depth (B, 1, H, W), (B, H, W, 1) or (B, H, W), poses (B, 4, 4) or (4, 4), the
-    rest (B, D), and `task`. inputs: of the server's metadata; what it does not name stays here.
+    batch: images (B, 3, H, W) or (B, H, W, 3), depth (B, 1, H, W), (B, H, W, 1) or (B, H, W), poses (B, 4, 4) or (4, 4), or as
+    16 numbers, the rest (B, D), and `task`. inputs: of the server's metadata; what it does not name stays here.
     """
     tensors = {key: batch[key].detach().cpu() for key in inputs if isinstance(batch.get(key), Tensor)}
     if not tensors:
@@ -29,7 +30,7 @@ def requests_of(batch: Mapping[str, Any], inputs: Mapping[str, Mapping[str, Any]
 def _packed(key: str, tensor: Tensor, size: int) -> np.ndarray:
     """A batch in the dtype and layout of the wire."""
     if key.startswith(CALIBRATION_PREFIX):
-        return tensor.float().expand(size, 4, 4).contiguous().numpy()
+        return as_pose(tensor.float(), key).expand(size, 4, 4).contiguous().numpy()
     if is_geometry_key(key):
         return _packed_depth(tensor)
     if tensor.ndim == 4:

@@ -1,0 +1,119 @@
+"""Calibrations and poses that do not belong to the images, or to the robot: refused, or taken as they are meant."""
+
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+
+from lerobot_policy_pi05_geometry.geometry.calibration import Rig, parse_calibration
+from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
+from lerobot_policy_pi05_geometry.geometry.keys import RIG
+from lerobot_policy_pi05_geometry.geometry.placed_camera import PlacedCamera
+from lerobot_policy_pi05_geometry.geometry.rigid import FARTHEST, identity_rows
+
+from ..entry_points import (
+    WRIST_POSE,
+    make_batch,
+    make_calibration,
+    make_features,
+    make_observation,
+    make_policy,
+    without,
+)
+from ..serving.running import make_rigs
+
+
+def placed(size: tuple[int, int], rotation: int = 0) -> PlacedCamera:
+    camera = CameraCalibration([600.0, 600.0, 319.5, 239.5], [640, 480], identity_rows(), rotation=rotation)
+    return PlacedCamera("front", {0: Rig({"front": camera})}, size)
+
+
+@pytest.mark.parametrize("size", [(480, 640), (240, 320), (84, 112), (63, 84), (53, 70), (10, 13)])
+def test_a_view_that_is_only_resized_is_taken(size):
+    placed(size)
+    placed(size[::-1], rotation=90)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (480, 848), (224, 224), (360, 640)])
+def test_images_of_another_shape_than_the_calibration_are_refused(size):
+    """They were turned, cropped or squeezed: no scale makes these intrinsics theirs."""
+    with pytest.raises(ValueError, match=r"Images of camera 'front' are .* its calibration is of 640 x 480"):
+        placed(size)
+    if size != (640, 480):
+        with pytest.raises(ValueError, match="another shape"):
+            placed(size[::-1], rotation=90)
+
+
+@pytest.mark.parametrize(
+    "intrinsics",
+    [[0.9, 1.2, 0.5, 0.5], [600, 600, 5000, 240], [600, 600, 320, -3000], [60_000, 600, 320, 240], [600, 20, 320, 240]],
+)
+def test_intrinsics_that_are_no_pixels_of_the_image_are_refused(intrinsics):
+    content = {"frame": "base", "cameras": {"front": {"intrinsics": intrinsics, "size": [640, 480]}}}
+    with pytest.raises(ValueError, match="no pixels of an image of 640 x 480"):
+        parse_calibration(content, "file")
+
+
+def test_a_translation_in_millimetres_is_refused():
+    pose = identity_rows()
+    pose[2][3] = 900.0
+    content = {"intrinsics": [600, 600, 320, 240], "size": [640, 480], "extrinsics": pose}
+    with pytest.raises(ValueError, match="give metres, not millimetres"):
+        parse_calibration({"frame": "base", "cameras": {"front": content}}, "file")
+    pose[2][3] = FARTHEST - 1
+    parse_calibration({"frame": "base", "cameras": {"front": content}}, "file")
+    policy, observation = make_policy().eval(), make_observation(2)
+    observation[WRIST_POSE][1, 0, 3] = 400.0
+    with pytest.raises(ValueError, match=r"wrist\.extrinsics has a translation of more than 100 m"):
+        policy.geometry.source(observation)
+
+
+def test_rigs_have_numbers():
+    with pytest.raises(ValueError, match="give a whole number as its name"):
+        parse_calibration({"version": 2, "frame": "base", "rigs": {"left": {"cameras": {}}}}, "file")
+
+
+# --- which rig ----------------------------------------------------------------------------------------------------
+
+
+def rig_policy(**settings):
+    inputs, _ = make_features()
+    inputs[RIG] = PolicyFeature(FeatureType.STATE, (1,))
+    return make_policy(calibration={}, rigs=make_rigs(identity_rows()), input_features=inputs, **settings)
+
+
+def test_a_rig_that_the_data_contradicts_is_refused_and_never_used():
+    """With --policy.rig=2 every frame would have rig 2's geometry, without a word."""
+    batch = make_batch(2) | {RIG: torch.tensor([[2], [5]])}
+    several, one = rig_policy().train(), rig_policy(rig=2).train()
+    with pytest.raises(ValueError, match=r"rig has 2, 5, but --policy\.rig is 2; train .* with --policy\.rig=null"):
+        one.forward(batch)
+    found, expected = (policy.geometry.source(batch, check=False) for policy in (one, several))
+    assert torch.equal(found.features, expected.features)
+    alone = make_batch(2) | {RIG: torch.tensor([[2], [2]])}
+    assert torch.equal(one.geometry.source(alone).features, several.geometry.source(alone).features)
+    told = without(alone, RIG)
+    assert torch.equal(one.geometry.source(told).features, several.geometry.source(alone).features)
+
+
+# --- turned images ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("source", ["rgbd", "rays"])
+@pytest.mark.parametrize("rotation", [90, 180, 270])
+def test_a_pose_that_comes_with_the_frame_holds_for_the_sensor_as_the_calibrations_does(source, rotation):
+    """The same pose, once in the calibration and once in the frame, gives the same geometry."""
+    observation = make_observation(2)
+    observation[WRIST_POSE] = observation[WRIST_POSE][:1].expand(2, 4, 4).clone()
+    in_frame, in_file = make_calibration(), make_calibration()
+    for calibration in (in_frame, in_file):
+        calibration["wrist"].rotation = rotation
+        calibration["wrist"].size = calibration["wrist"].size[::-1] if rotation % 180 else calibration["wrist"].size
+    in_file["wrist"].extrinsics = observation[WRIST_POSE][0].tolist()
+    inputs = {key: feature for key, feature in make_features()[0].items() if key != WRIST_POSE}
+    framed = make_policy(geometry_source=source, calibration=in_frame).eval()
+    filed = make_policy(geometry_source=source, calibration=in_file, input_features=inputs).eval()
+    found = framed.geometry.source(observation)
+    expected = filed.geometry.source(without(observation, WRIST_POSE))
+    torch.testing.assert_close(found.features, expected.features, atol=1e-5, rtol=1e-5)
+    straight = make_policy(geometry_source=source).eval().geometry.source(observation)
+    assert (straight.features[:, 1] - found.features[:, 1]).abs().max() > 1e-2
