@@ -66,13 +66,6 @@ def check_dropout(config: "PI05GeometryConfig") -> None:
     for name, rate in rates.items():
         if not 0 <= rate < 1:
             raise ValueError(f"{name} must be in [0, 1), got {rate}.")
-    if not 0 <= config.geometry_flow_dropout < 1:
-        raise ValueError(f"geometry_flow_dropout must be in [0, 1), got {config.geometry_flow_dropout}.")
-    if config.geometry_flow_dropout and config.geometry_placement == "prefix":
-        raise ValueError(
-            "geometry_flow_dropout needs geometry_placement=segment: flow samples share the prefix, so geometry in the prefix "
-            "cannot be left out for some of them."
-        )
     if sum(rates.values()) > 1 + 1e-9:
         told = ", ".join(f"{name} {rate}" for name, rate in rates.items())
         raise ValueError(f"One draw decides what a training sample goes without, so {told} must not exceed 1 together.")

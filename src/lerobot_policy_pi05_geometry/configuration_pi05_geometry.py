@@ -113,9 +113,6 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     geometry_dropout: float = 0.2
     image_dropout: float = 0.3
     camera_dropout: float = 0.0
-    # Share of the flow samples (flow_samples) of an observation with everything that go without geometry: one observation then
-    # teaches to act with geometry and without, at no further cost.
-    geometry_flow_dropout: float = 0.0
     depth_unit: str = "mm"  # unit of the depth that arrives: mm (LeRobot's default) or m
     max_depth: float = 10.0  # metres; farther counts as not measured
     # What training adds to depth: noise, holes, errors of scale and pose (geometry/depth_augmentation.py). Off.
@@ -323,7 +320,7 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
     @property
     def dropout_rates(self) -> DropoutRates:
         """What training samples go without, and how often."""
-        return DropoutRates(self.geometry_dropout, self.image_dropout, self.camera_dropout, self.geometry_flow_dropout)
+        return DropoutRates(self.geometry_dropout, self.image_dropout, self.camera_dropout)
 
     def depth_cameras(self) -> dict[str, tuple[int, int]]:
         """Cameras with depth, in token order, and their (height, width)."""

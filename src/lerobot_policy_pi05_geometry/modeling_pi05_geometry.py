@@ -250,9 +250,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if self.training and self.config.depth_augmentation:
             batch = {**batch, AUGMENTATION_KEY: draw.key.to(device)}
         embs, pad = (None, None) if self.geometry is None else self._measure(batch)
-        sees_geometry = None
         if self.training:
-            img_masks, pad, sees_geometry = drop(draw, self.config.dropout_rates, self._cameras(), img_masks, pad)
+            img_masks, pad = drop(draw, self.config.dropout_rates, self._cameras(), img_masks, pad)
         losses: Tensor = self.model(
             images,
             img_masks,
@@ -264,7 +263,6 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             embs,
             pad,
             delay=draw.delay.to(device) if self.config.rtc_training_max_delay else None,
-            sees_geometry=sees_geometry,
         )
         return losses.mean(dim=1) if losses.ndim == 4 else losses
 

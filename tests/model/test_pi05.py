@@ -378,49 +378,6 @@ def test_flow_samples_are_blind_to_each_other(geometry: GeometrySegmentConfig | 
     assert_near(list(together.unbind(1)), alone)
 
 
-@pytest.mark.parametrize("geometry", [SEGMENT, PARALLEL, DENOISE, OWN_EXPERT], ids=name_of)
-@given(case=cases, samples=st.integers(1, 4))
-@settings(max_examples=6)
-def test_a_flow_sample_that_does_not_see_geometry_has_the_loss_without_it(
-    geometry: GeometrySegmentConfig, case: Case, samples: int
-) -> None:
-    """Beside flow samples that see it: each has the loss, and the gradients, that it has alone with its geometry masked."""
-    network = shared_network(geometry)
-    batch = case.draw(network.geometry_width)
-    generator = torch.Generator().manual_seed(case.seed)
-    noise = torch.randn(case.batch, samples, *batch.noise.shape[1:], generator=generator)
-    time = torch.rand(case.batch, samples, generator=generator)
-    sees = torch.rand(case.batch, samples, generator=generator) < 0.5
-    together = network(*batch._replace(noise=noise, time=time), sees_geometry=sees)
-    alone = []
-    for k in range(samples):
-        pad = batch.geom_pad & sees[:, k, None]
-        alone.append(network(*batch._replace(noise=noise[:, k], time=time[:, k], geom_pad=pad)))
-    assert_near(list(together.unbind(1)), alone, tolerance=5e-6)
-    parameters = [p for p in network.parameters() if p.requires_grad]
-    found, expected = (
-        torch.autograd.grad(loss.mean(), parameters, allow_unused=True) for loss in (together, torch.stack(alone, 1))
-    )
-    for one, other in zip(found, expected, strict=True):
-        if one is not None and other is not None:
-            torch.testing.assert_close(one, other, atol=1e-4, rtol=1e-3)
-
-
-def test_flow_samples_without_geometry_need_a_segment_and_an_entry_each() -> None:
-    batch = Case(seed=12, batch=2).draw(shared_network(SEGMENT).geometry_width)
-    several = batch._replace(noise=torch.randn(2, 3, *batch.noise.shape[1:]), time=torch.rand(2, 3))
-    sees = torch.ones(2, 3, dtype=torch.bool)
-    with pytest.raises(ValueError, match=r"entry for every flow sample, \(2, 3\), got \(2, 2\)"):
-        shared_network(SEGMENT)(*several, sees_geometry=sees[:, :2])
-    with pytest.raises(ValueError, match="mask its geometry"):
-        shared_network(SEGMENT)(*batch, sees_geometry=sees[:, 0])
-    with pytest.raises(ValueError, match="a segment of its own"):
-        shared_network(SEGMENT)(*several.without_geometry, sees_geometry=sees)
-    prefix = Case(seed=12, batch=2).draw(shared_network(IN_PREFIX).geometry_width)
-    with pytest.raises(ValueError, match="a segment of its own"):
-        shared_network(IN_PREFIX)(*prefix._replace(noise=several.noise, time=several.time), sees_geometry=sees)
-
-
 @pytest.mark.parametrize("geometry", [SEGMENT, PARALLEL, DENOISE], ids=name_of)
 def test_denoise_step_from_a_filled_cache(geometry: GeometrySegmentConfig) -> None:
     """The public step equals the velocity of training, with a flow time of its own in each row."""

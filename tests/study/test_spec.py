@@ -65,7 +65,6 @@ def test_the_default_study_is_the_one_that_was_promised(tmp_path):
         "noise-times",
         "uniform-times",
         "even-dropout",
-        "flow-dropout",
         "pooled",
     }
     assert max(arms.values(), key=len) == set(ARMS) - of_other_studies

@@ -14,10 +14,9 @@ CELLS = 4
 NAMES = ("front", "wrist", "left", "right")
 
 
-def draws(u: torch.Tensor, which: torch.Tensor, samples: int = 1) -> FlowDraw:
+def draws(u: torch.Tensor, which: torch.Tensor) -> FlowDraw:
     nothing = torch.zeros(len(u))
-    time = nothing if samples == 1 else torch.zeros(len(u), samples)
-    return FlowDraw(nothing, time, u, which, nothing, nothing)
+    return FlowDraw(nothing, nothing, u, which, nothing, nothing)
 
 
 @st.composite
@@ -56,8 +55,7 @@ def per_camera(
 def test_against_the_rule_row_by_row(situation) -> None:
     """At most one thing is lost, never the last, nothing comes back, and the draw says which."""
     rates, cameras, images, pad, u, which = situation
-    left_images, left_pad, sees_geometry = drop(draws(u, which), rates, cameras, images, pad)
-    assert sees_geometry is None
+    left_images, left_pad = drop(draws(u, which), rates, cameras, images, pad)
     for row in range(len(u)):
         had = per_camera(cameras, images, pad, row)
         had_images = any(mask[row] for mask in images)
@@ -88,7 +86,7 @@ def test_a_geometry_camera_without_an_image_that_is_lost_across_views_leaves_the
     """Features that come from all views are all lost with one of them."""
     cameras = Cameras(["front", "wrist"], ["front", "wrist"], across_views=True)
     ones = torch.ones(1, dtype=torch.bool)
-    images, pad, _ = drop(
+    images, pad = drop(
         draws(torch.tensor([0.0]), torch.tensor([0.0])),
         DropoutRates(0.0, 0.0, 0.9),
         cameras,
@@ -108,61 +106,12 @@ def test_as_often_as_told(rates: DropoutRates) -> None:
     u, which = torch.rand(count, generator=generator), torch.rand(count, generator=generator)
     ones = torch.ones(count, dtype=torch.bool)
     cameras = Cameras(["front", "wrist"], ["front"], across_views=False)
-    images, pad, _ = drop(draws(u, which), rates, cameras, [ones, ones], ones[:, None].repeat(1, CELLS))
+    images, pad = drop(draws(u, which), rates, cameras, [ones, ones], ones[:, None].repeat(1, CELLS))
     no_images, no_cells = ~images[0] & ~images[1], ~pad.any(dim=1)
     one_image = images[0] ^ images[1]
     # half of the lost cameras are the front one, which takes the cells along
     found = [no_images.float().mean(), one_image.float().mean(), no_cells.float().mean()]
     assert found == pytest.approx([rates.images, rates.camera, rates.geometry + rates.camera / 2], abs=0.015)
-
-
-@given(situations(), st.integers(1, 5), st.floats(0, 0.99))
-def test_flow_samples_without_geometry_are_those_of_samples_with_everything(
-    situation, samples: int, flow: float
-) -> None:
-    """Beside the rest of dropout, which stays as it is; from a sample that has no image nothing is taken."""
-    rates, cameras, images, pad, u, which = situation
-    left_images, left_pad, _ = drop(draws(u, which), rates, cameras, images, pad)
-    found = drop(draws(u, which, samples), rates._replace(flow=flow), cameras, images, pad)
-    assert all(torch.equal(a, b) for a, b in zip(found.images, left_images, strict=True))
-    if pad is None:
-        assert found.geometry is None
-        assert found.sees_geometry is None
-        return
-    seen = found.geometry[:, None] & (torch.ones(len(u), samples) > 0)[..., None]  # (B, K, cells)
-    if found.sees_geometry is not None:
-        assert found.sees_geometry.shape == (len(u), samples)
-        assert torch.equal(found.geometry, left_pad)
-        seen = seen & found.sees_geometry[..., None]
-    else:
-        assert samples == 1 or not flow
-    whole = (u >= rates.geometry + rates.camera) & (u < 1 - rates.images) & torch.stack(images).any(dim=0)
-    for row in range(len(u)):
-        without = [not torch.equal(seen[row, k], left_pad[row]) for k in range(samples)]
-        if not left_pad[row].any():
-            continue
-        if not whole[row]:
-            assert not any(without)
-        else:
-            assert abs(sum(without) - flow * samples) < 1 + 1e-5
-            assert not seen[row][torch.tensor(without)].any()
-
-
-@pytest.mark.parametrize(("samples", "flow"), [(1, 0.3), (4, 0.5), (4, 0.3), (3, 0.9)])
-def test_flow_samples_go_without_geometry_as_often_as_told(samples: int, flow: float) -> None:
-    count, rates = 20_000, DropoutRates(0.1, 0.3, 0.1, flow)
-    generator = torch.Generator().manual_seed(0)
-    u, ones = torch.rand(count, generator=generator), torch.ones(count, dtype=torch.bool)
-    cameras = Cameras(["front", "wrist"], ["front", "wrist"], across_views=False)
-    pad = ones[:, None].repeat(1, 2 * CELLS)
-    found = drop(draws(u, torch.zeros(count), samples), rates, cameras, [ones, ones], pad)
-    whole = (u >= 0.2) & (u < 0.7)
-    if samples == 1:
-        without = ~found.geometry.any(dim=1)
-        assert float(without[whole].float().mean()) == pytest.approx(flow, abs=0.015)
-    else:
-        assert float((~found.sees_geometry[whole]).float().mean()) == pytest.approx(flow, abs=0.015)
-        assert found.sees_geometry[~whole].all()
 
 
 # --- in the policy ----------------------------------------------------------------------------------------------------
@@ -219,38 +168,3 @@ def test_a_policy_without_geometry_keeps_its_images() -> None:
     plain.load_state_dict(policy.state_dict())
     batch = make_batch(2)
     assert torch.equal(policy.forward(batch)[0], plain.forward(batch)[0])
-
-
-def test_every_flow_sample_without_geometry_is_a_sample_without_geometry() -> None:
-    """The loss of an observation, half of whose flow samples go without geometry, is between those with and without."""
-    rates = {"image_dropout": 0.0, "flow_samples": 2}
-    policy, batch = make_policy(**rates, geometry_dropout=0.0, geometry_flow_dropout=0.5).train(), make_batch(3)
-    losses = []
-    for dropped in (0.0, 0.999999):
-        other = make_policy(**rates, geometry_dropout=dropped).train()
-        other.load_state_dict(policy.state_dict())
-        losses.append(_per_flow_sample(other, batch))
-    found = _per_flow_sample(policy, batch)
-    torch.testing.assert_close(found[:, 0], losses[1][:, 0])  # the first one goes without
-    torch.testing.assert_close(found[:, 1], losses[0][:, 1])
-    assert not torch.allclose(losses[0], losses[1])
-
-
-def _per_flow_sample(policy, batch) -> torch.Tensor:
-    seen = []
-    handle = policy.model.register_forward_hook(lambda module, args, losses: seen.append(losses.detach()))
-    policy.forward(batch)
-    handle.remove()
-    return seen[0]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"geometry_flow_dropout": 1.0}, "geometry_flow_dropout must be in"),
-        ({"geometry_flow_dropout": 0.5, "geometry_placement": "prefix"}, "share the prefix"),
-    ],
-)
-def test_impossible_flow_dropout_is_refused(options, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        make_policy(**options)

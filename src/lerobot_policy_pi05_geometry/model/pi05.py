@@ -118,7 +118,6 @@ class PI05Pytorch(nn.Module):
         geom_pad: Tensor | None = None,
         geom_att: AttMasks | Tensor | None = None,
         delay: Tensor | None = None,
-        sees_geometry: Tensor | None = None,
     ) -> Tensor:
         """Flow-matching loss of every action entry, unreduced, in the shape of `noise`, float32.
 
@@ -126,24 +125,14 @@ class PI05Pytorch(nn.Module):
         observation share one pass over prefix and geometry, blind to each other and all at the same positions.
         geom_embs: (B, G, W) tokens of the geometry adapter, geom_pad: (B, G) bool, False for a hole, geom_att: G
         entries, or a tensor (G,) or (B, G) with equal rows; one block by default. delay: (B,) int64, the first steps that are
-        given clean, at flow time 0, as in trained RTC; their entries of the result are no loss. sees_geometry: (B, K) bool,
-        False for a flow sample whose loss is the one without geometry; None: all see it. The rest as in `embed_prefix`.
+        given clean, at flow time 0, as in trained RTC; their entries of the result are no loss. The rest as in `embed_prefix`.
         """
         samples = noise.shape[1] if noise.ndim == 4 else 1
-        if sees_geometry is not None:
-            self._check_sees_geometry(sees_geometry, time, geom_embs)
         # Every flow time has a geometry of its own, so the samples cannot share it.
         if noise.ndim == 4 and self.geometry_follows_time:
-            observation, flow = (
-                (images, img_masks, tokens, masks, actions),
-                zip(noise.unbind(1), time.unbind(1), strict=True),
-            )
-            pads = _pad_per_sample(geom_embs, geom_pad, sees_geometry, samples)
-            losses = [
-                self.forward(*observation, n, t, geom_embs, pad, geom_att, delay)
-                for (n, t), pad in zip(flow, pads, strict=True)
-            ]
-            return torch.stack(losses, dim=1)
+            observation, others = (images, img_masks, tokens, masks), (geom_embs, geom_pad, geom_att, delay)
+            flow = zip(noise.unbind(1), time.unbind(1), strict=True)
+            return torch.stack([self.forward(*observation, actions, n, t, *others) for n, t in flow], dim=1)
         step_time = time if delay is None else _time_per_step(time, noise.shape[-2], delay)  # (B[, K][, S])
         t = step_time[..., None, None] if delay is None else step_time[..., None]
         clean = actions if noise.ndim == 3 else actions[:, None]
@@ -154,9 +143,7 @@ class PI05Pytorch(nn.Module):
                 x_t.flatten(1, -2), step_time if step_time.ndim == 1 else step_time.flatten(1)
             )
             suffix, geometry_cond = SegmentTokens(embs, pad, att), self._geometry_cond(geometry, time)
-            output, _ = self._run(
-                [prefix, geometry, suffix], cond, geometry_cond, samples=samples, sees_geometry=sees_geometry
-            )
+            output, _ = self._run([prefix, geometry, suffix], cond, geometry_cond, samples=samples)
             velocity = self.action_out_proj(output).view_as(noise)
         return F.mse_loss(velocity, noise - clean, reduction="none")
 
@@ -302,19 +289,16 @@ class PI05Pytorch(nn.Module):
         cache: SegmentKVCache | None = None,
         given: Sequence[bool] = (True, True, True),
         samples: int = 1,
-        sees_geometry: Tensor | None = None,
     ) -> tuple[Tensor | None, SegmentKVCache | None]:
         """Run the given ones of these segments; the others are in the cache. Returns the suffix's output (B, S, W)."""
         pads = [None if s is None else s.pad for s in segments]
         atts = [None if s is None else s.att for s in segments]
         inputs = [s if keep else None for s, keep in zip(segments, given, strict=True)]
         geometry = self.config.geometry
-        positions = segment_positions(pads, geometry.positions if geometry else "sequential", samples, sees_geometry)
+        positions = segment_positions(pads, geometry.positions if geometry else "sequential", samples)
         outputs, cache = self.paligemma_with_expert(
             attention_mask=[
-                None
-                if inputs[s] is None
-                else segment_mask(s, pads, atts, *((samples, sees_geometry) if s is Segment.SUFFIX else ()))
+                None if inputs[s] is None else segment_mask(s, pads, atts, samples if s is Segment.SUFFIX else 1)
                 for s in Segment
             ],
             position_ids=positions,
@@ -325,16 +309,6 @@ class PI05Pytorch(nn.Module):
             outputs=(False, False, True),
         )
         return outputs[Segment.SUFFIX], cache
-
-    def _check_sees_geometry(self, sees_geometry: Tensor, time: Tensor, geom_embs: Tensor | None) -> None:
-        """Raise ValueError unless flow samples can go without geometry one by one."""
-        if geom_embs is None or self.geometry_in_prefix:
-            raise ValueError("sees_geometry needs geometry in a segment of its own: all flow samples share the prefix.")
-        if time.ndim != 2 or sees_geometry.shape != time.shape:
-            raise ValueError(
-                f"sees_geometry needs an entry for every flow sample, {tuple(time.shape)}, got {tuple(sees_geometry.shape)}; "
-                "for a single one mask its geometry (geom_pad)."
-            )
 
     def _geometry_cond(self, geometry: SegmentTokens | None, time: Tensor | None) -> Tensor | None:
         """The adaRMS condition of geometry, (1, W) at the clean end of the flow, time 0: geometry is a clean observation.
@@ -351,16 +325,6 @@ class PI05Pytorch(nn.Module):
 def _silence(embs: Tensor, pad: Tensor) -> Tensor:
     """Zero padded slots: a masked key has no effect, but a NaN in it would (NaN + -inf is NaN)."""
     return embs.masked_fill(~pad[..., None], 0)
-
-
-def _pad_per_sample(
-    embs: Tensor | None, pad: Tensor | None, sees_geometry: Tensor | None, samples: int
-) -> list[Tensor | None]:
-    """The validity of geometry (B, G) for each flow sample."""
-    if embs is None or sees_geometry is None:
-        return [pad] * samples
-    valid = torch.ones(embs.shape[:2], dtype=torch.bool, device=embs.device) if pad is None else pad
-    return [valid & seen[:, None] for seen in sees_geometry.unbind(1)]
 
 
 def _time_per_step(time: Tensor, steps: int, delay: Tensor) -> Tensor:

@@ -45,17 +45,12 @@ def make_att_mask(pad_masks: Tensor, att_masks: AttMasks) -> Tensor:
 
 
 def segment_mask(
-    segment: Segment,
-    pads: Sequence[Tensor | None],
-    atts: Sequence[AttMasks | None],
-    samples: int = 1,
-    sees_geometry: Tensor | None = None,
+    segment: Segment, pads: Sequence[Tensor | None], atts: Sequence[AttMasks | None], samples: int = 1
 ) -> Tensor:
     """Attention mask of one segment's queries against the keys of all segments up to its own.
 
     pads, atts: per segment, (B, N_i) bool and N_i entries; None for an absent segment.
     samples: flow samples that stand side by side in the segment and do not attend to each other (the suffix in training).
-    sees_geometry: (B, samples) bool, False for a flow sample that goes without geometry; None: all see it.
     Returns (B, 1, K) bool where every query of the segment sees the same keys, else (B, Q, K).
     """
     present = [s for s in Segment if s <= segment and pads[s] is not None]
@@ -75,12 +70,8 @@ def segment_mask(
     own = blocks[start:]
     if own and own[0] != own[-1]:
         return make_att_mask(keys, flat)[:, start:]
-    if samples == 1 and sees_geometry is None:
+    if samples == 1:
         return keys[:, None, :]
     sample = torch.arange(lengths[-1], device=keys.device) // (lengths[-1] // samples)  # (N,)
     earlier = torch.ones(lengths[-1], start, dtype=torch.bool, device=keys.device)
-    mask = keys[:, None, :] & torch.cat([earlier, sample[:, None] == sample[None]], dim=1)  # (B, N, K)
-    if sees_geometry is not None:
-        prefix = 0 if pads[Segment.PREFIX] is None else pads[Segment.PREFIX].shape[1]
-        mask[:, :, prefix:start] &= sees_geometry[:, sample, None]
-    return mask
+    return keys[:, None, :] & torch.cat([earlier, sample[:, None] == sample[None]], dim=1)

@@ -80,17 +80,14 @@ class SegmentTokens(NamedTuple):
         return SegmentTokens(embs, torch.cat([self.pad, other.pad], dim=1), [0] * embs.shape[1])
 
 
-def segment_positions(
-    pads: Sequence[Tensor | None], rule: GeometryPositions, samples: int = 1, sees_geometry: Tensor | None = None
-) -> list[Tensor | None]:
+def segment_positions(pads: Sequence[Tensor | None], rule: GeometryPositions, samples: int = 1) -> list[Tensor | None]:
     """Rotary positions of each segment.
 
     sequential: cumsum over P|G|S - 1, so geometry moves the suffix, and so does a hole in it.
     parallel: the suffix counts P|S, as if geometry were not there; cell i stands at the first position after the
         prefix plus i, whether or not the cells before it are holes.
 
-    pads: per segment (B, N_i) bool or None. samples: flow samples in the suffix, which all stand at the same positions, but
-    for those that do not see geometry (sees_geometry, (B, samples) bool): to them all of it is holes.
+    pads: per segment (B, N_i) bool or None. samples: flow samples in the suffix, which all stand at the same positions.
     Returns per segment (B, N_i) int64 or None.
     """
     prefix, geometry, suffix = pads
@@ -106,9 +103,7 @@ def segment_positions(
             )
         else:
             positions[Segment.GEOMETRY] = after + geometry.cumsum(dim=1) - 1
-            length = geometry.sum(dim=1, keepdim=True)  # (B, 1)
-            after = after + (length if sees_geometry is None else length * sees_geometry)  # (B, 1) or (B, samples)
+            after = after + geometry.sum(dim=1, keepdim=True)
     if suffix is not None:
-        own = suffix.unflatten(1, (samples, -1)).cumsum(dim=2) - 1  # (B, samples, S)
-        positions[Segment.SUFFIX] = (own + (after if isinstance(after, int) else after[..., None])).flatten(1)
+        positions[Segment.SUFFIX] = after + (suffix.unflatten(1, (samples, -1)).cumsum(dim=2) - 1).flatten(1)
     return positions

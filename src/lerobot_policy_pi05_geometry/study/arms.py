@@ -71,12 +71,6 @@ ARMS = {
     "even-dropout": _geometry(
         "cameras masked in 30 % of the training samples, geometry in 40 %", image_dropout="0.3", geometry_dropout="0.4"
     ),
-    "flow-dropout": _geometry(
-        "cameras masked in 30 % of the training samples; of the others, geometry in half of the flow samples",
-        image_dropout="0.3",
-        geometry_dropout="0",
-        geometry_flow_dropout="0.5",
-    ),
     "augmented": _geometry(
         "geometry with noise, holes and errors of scale and pose added to depth in training",
         _DEPTH_AND_POSE,

@@ -21,7 +21,7 @@ class AttentionShare:
         self._attentions = [layers[i].self_attn.attention for i in sorted({0, len(layers) // 2, len(layers) - 1})]
         self._geometry = geometry
         self._shares: list[Tensor] = []
-        self._actions: list[Tensor] = []
+        self._samples: list[Tensor] = []
 
     @contextmanager
     def measuring(self) -> Iterator[None]:
@@ -40,13 +40,13 @@ class AttentionShare:
             return
         end = k.shape[2] - q.shape[2]  # keys are prefix, geometry, suffix
         columns = slice(end - self._geometry, end)
-        share = attention_weights(q, k, mask, bias)[..., columns].float().sum(dim=-1).mean(dim=1)  # (B, Q)
-        sees_geometry = mask[..., columns].any(dim=-1).expand_as(share)
-        self._shares.append((share * sees_geometry).sum())
-        self._actions.append(sees_geometry.sum())
+        share = attention_weights(q, k, mask, bias)[..., columns].float().sum(dim=-1).mean(dim=(1, 2))  # (B,)
+        has_geometry = mask[..., columns].flatten(1).any(dim=1)
+        self._shares.append((share * has_geometry).sum())
+        self._samples.append(has_geometry.sum())
 
     def mean(self) -> Tensor | None:
-        """Share in [0, 1], the mean over layers, heads and the actions that see geometry; None if nothing was measured."""
-        if not self._actions:
+        """Share in [0, 1], the mean over layers, heads, actions and the samples that have geometry; None if nothing was seen."""
+        if not self._samples:
             return None
-        return torch.stack(self._shares).sum() / torch.stack(self._actions).sum().clamp_min(1)
+        return torch.stack(self._shares).sum() / torch.stack(self._samples).sum().clamp_min(1)

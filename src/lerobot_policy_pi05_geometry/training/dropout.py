@@ -12,14 +12,7 @@ what a sample goes without, so it is one thing at most:
 Nothing is taken from a sample that has nothing else to see by: no geometry where no image is there, no images where no cell of
 geometry is valid, no camera that is the only one.
 
-A sample with everything can teach both, acting with geometry and without, at no further cost: its flow samples share one pass
-over prefix and geometry, and `flow` is the share of them whose actions do not attend to geometry:
-
-```
-   flow samples of one observation, K = 4, flow = 0.5        1 . without geometry    2 . without    3 x with    4 x with
-```
-
-Shapes: B batch, K flow samples, I RGB cameras, V geometry cameras, G cells of one, N cameras in all.
+Shapes: B batch, I RGB cameras, V geometry cameras, G cells of one, N cameras in all.
 """
 
 from collections.abc import Sequence
@@ -32,24 +25,11 @@ from ..model.flow_matching import FlowDraw
 
 
 class DropoutRates(NamedTuple):
-    """Probabilities, at most 1 together, and the share of flow samples without geometry. All 0: nothing is dropped."""
+    """Probabilities, at most 1 together. All 0: nothing is dropped."""
 
     geometry: float
     images: float
     camera: float
-    flow: float = 0.0
-
-
-class Dropped(NamedTuple):
-    """Masks of a training batch after dropout.
-
-    images: I masks (B,) bool. geometry: (B, V * G) bool, or None without geometry. sees_geometry: (B, K) bool, False for a flow
-    sample that goes without geometry; None where all see it.
-    """
-
-    images: list[Tensor]
-    geometry: Tensor | None
-    sees_geometry: Tensor | None
 
 
 class Cameras(NamedTuple):
@@ -66,14 +46,14 @@ class Cameras(NamedTuple):
 
 def drop(
     draw: FlowDraw, rates: DropoutRates, cameras: Cameras, img_masks: Sequence[Tensor], geom_pad: Tensor | None
-) -> Dropped:
+) -> tuple[list[Tensor], Tensor | None]:
     """Masks of a training batch with what its draw takes away. No values are looked at, so no GPU is waited for.
 
-    draw: `dropout` and `camera` (B,), `time` (B,) or (B, K). img_masks: I masks (B,) bool. geom_pad: (B, V * G) bool, or None
-    without geometry.
+    draw: `dropout` and `camera` (B,). img_masks: I masks (B,) bool. geom_pad: (B, V * G) bool, or None without geometry.
+    Returns both, masked further.
     """
     if not any(rates) or not img_masks:
-        return Dropped(list(img_masks), geom_pad, None)
+        return list(img_masks), geom_pad
     device = img_masks[0].device
     u, which = draw.dropout.to(device), draw.camera.to(device)
     images = torch.stack(list(img_masks), dim=1)  # (B, I)
@@ -90,27 +70,7 @@ def drop(
         lost_images = lost_images | (camera_drawn[:, None] & of_image)
         lost_cells = lost_cells | (camera_drawn[:, None] & of_cells)
     cells = cells & ~lost_cells[..., None]
-    sees_geometry = None
-    if rates.flow and geom_pad is not None:
-        whole = ~geometry_drawn & ~camera_drawn & ~images_drawn & images.any(dim=1)
-        lost_flow = whole[:, None] & _flow_samples(u, rates, 1 if draw.time.ndim == 1 else draw.time.shape[1])  # (B, K)
-        if draw.time.ndim == 1:
-            cells = cells & ~lost_flow[..., None]
-        else:
-            sees_geometry = ~lost_flow
-    left = list((images & ~lost_images).unbind(1))
-    return Dropped(left, None if geom_pad is None else cells.flatten(1), sees_geometry)
-
-
-def _flow_samples(u: Tensor, rates: DropoutRates, samples: int) -> Tensor:
-    """Which flow samples of samples with everything go without geometry, (B, K) bool: the first `flow` * K of them.
-
-    Where that is no whole number, u (B,) decides between the next lower and the next higher one.
-    """
-    first, last = rates.geometry + rates.camera, 1 - rates.images
-    within = ((u - first) / max(last - first, 1e-6)).clamp(0, 1 - 1e-6)  # uniform over samples with everything
-    count = (rates.flow * samples + within).floor()
-    return torch.arange(samples, device=u.device) < count[:, None]
+    return list((images & ~lost_images).unbind(1)), None if geom_pad is None else cells.flatten(1)
 
 
 def _one_camera(which: Tensor, cameras: Cameras, images: Tensor, geometry: Tensor) -> tuple[Tensor, Tensor]:
