@@ -4,8 +4,10 @@ import math
 
 import pytest
 import torch
+from lerobot.configs import NormalizationMode
 from lerobot.processor import PolicyProcessorPipeline
 
+from lerobot_policy_pi05_geometry.data.normaliser_scale import NormaliserScaleStep
 from lerobot_policy_pi05_geometry.data.relative_actions import ACTION_ANCHOR
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from lerobot_policy_pi05_geometry.processor_pi05_geometry import make_pi05_geometry_pre_post_processors
@@ -16,6 +18,7 @@ from tests.entry_points import (
     FRONT_DEPTH,
     GEOMETRY,
     STATE,
+    STATE_DIM,
     TOKENS,
     WRIST,
     WRIST_POSE,
@@ -130,6 +133,25 @@ def test_a_state_dimension_without_width_is_written_as_its_constant(arriving):
     assert found["task"][0].split("State: ")[1].split(" ")[3] == "0"  # as LeRobot's pi05 writes it in training
     other[:, 2] = -other[:, 2]
     assert not torch.equal(preprocessor(observation | {STATE: other})[TOKENS], expected[TOKENS])
+
+
+@pytest.mark.parametrize("arriving", [0.7, 0.71, -3.0])
+def test_under_mean_and_deviation_a_constant_is_0_as_for_lerobot(arriving):
+    mapping = {"VISUAL": NormalizationMode.IDENTITY, "STATE": NormalizationMode.MEAN_STD}
+    config = make_config(normalization_mapping=mapping | {"ACTION": NormalizationMode.MEAN_STD})
+    config.validate_features()
+    stats = {
+        key: {"mean": torch.zeros(size), "std": torch.ones(size)}
+        for key, size in ((STATE, STATE_DIM), ("action", ACTION_DIM))
+    }
+    stats[STATE]["mean"][3], stats[STATE]["std"][3] = 0.7, 0.0
+    preprocessor, _ = make_pi05_geometry_pre_post_processors(config, stats)
+    observation = make_observation()
+    observation[STATE][:, 3] = arriving
+    written = preprocessor(observation)["task"][0].split("State: ")[1].split(" ")[3]
+    assert written == "128"  # the bin of 0 in 256 bins from -1 to 1
+    ours = [step for step in preprocessor.steps if isinstance(step, NormaliserScaleStep)]
+    assert ours[0].get_config() == {"constant": 0.0}
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])

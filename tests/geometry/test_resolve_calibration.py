@@ -41,9 +41,16 @@ def test_a_given_file_comes_first(tmp_path, dataset):
     assert focal_length(config, dataset) == focal_length(config, None) == 10.0
 
 
-def test_what_was_given_once_holds_over_the_datasets(dataset):
+def test_what_was_given_once_holds_over_the_datasets_and_says_so(dataset, caplog):
     config = make_config(calibration=calibration_with_focal_length(30.0), calibration_given=True)
     assert focal_length(config, dataset) == 30.0
+    assert "another calibration than the one that was given" in caplog.text
+    caplog.clear()
+    assert (
+        focal_length(make_config(calibration=calibration_with_focal_length(20.0), calibration_given=True), dataset)
+        == 20.0
+    )
+    assert not caplog.text
 
 
 def test_without_a_given_file_the_datasets_holds_and_without_that_the_recorded_one(dataset):

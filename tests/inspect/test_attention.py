@@ -1,11 +1,12 @@
 """What is drawn is what the network did."""
 
+import numpy as np
 import pytest
 import torch
 
 from lerobot_policy_pi05_geometry.inspect.attention import attention_layout, suffix_attention
 from lerobot_policy_pi05_geometry.inspect.pictures import depth_figure, layout_figure, segment_share_figure
-from tests.entry_points import CHUNK, make_batch, make_policy
+from tests.entry_points import CHUNK, FRONT_DEPTH, make_batch, make_calibration, make_policy
 
 
 @pytest.fixture
@@ -55,3 +56,16 @@ def test_figures_are_drawn(source):
     if source == "rgbd":
         figures.append(depth_figure(policy, batch))
     assert all(figure.axes for figure in figures)
+
+
+def test_depth_is_shown_as_the_policy_reads_it():
+    """A D405 counts tenths of millimetres, and a codec that takes its counts for millimetres ends at 5 m here."""
+    calibration = make_calibration()
+    calibration["front"].depth_scale = 1e-4
+    policy = make_policy(calibration=calibration, geometry_cameras=["front"], depth_bounds={"front": [0.01, 5.0]})
+    batch = make_batch(1)
+    batch[FRONT_DEPTH] = torch.full((1, 1, 18, 24), 3000.0)
+    batch[FRONT_DEPTH][..., 12:] = 10000.0
+    shown = np.ma.filled(depth_figure(policy, batch).axes[1].images[0].get_array(), np.nan)
+    np.testing.assert_allclose(shown[:, :12], 0.3, atol=1e-6)
+    assert np.isnan(shown[:, 12:]).all()

@@ -1,6 +1,7 @@
 """From link files, a camera and a recording to a calibration file, by the commands."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -15,7 +16,7 @@ from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, Colo
 from lerobot_policy_pi05_geometry.geometry.kinematics import Arm, ForwardKinematics
 from lerobot_policy_pi05_geometry.robot import realsense
 from lerobot_policy_pi05_geometry.robot.board import Board
-from lerobot_policy_pi05_geometry.robot.calibrate import check_board_depth, image_stream, make_arm
+from lerobot_policy_pi05_geometry.robot.calibrate import check_board_depth, image_stream, keep_offsets, make_arm
 from lerobot_policy_pi05_geometry.robot.dataset_views import spread_out, still_frames
 from lerobot_policy_pi05_geometry.robot.link_files import read_links
 from pi05_geometry_cli import app
@@ -75,6 +76,22 @@ def test_joints_are_found_by_their_names():
         make_arm(so101_like().links, ["x", "y"])
     with pytest.raises(ValueError, match=r"no entry c; it has a, b"):
         make_arm(so101_like().links, ["a", "b"], {"elbow_flex": "c"})
+
+
+def test_offsets_stay_with_joints_that_stay_the_same():
+    """`calibrate arm` may be run again after hand-eye calibration has found the offsets."""
+    before = make_arm(so101_like().links, STATE_NAMES)
+    before.joints = [replace(joint, offset=0.1 * (i + 1)) for i, joint in enumerate(before.joints)]
+    again = make_arm(so101_like().links, STATE_NAMES)
+    assert keep_offsets(again, before) == [joint.joint for joint in before.joints]
+    assert again.joints == before.joints
+    turned = make_arm(so101_like().links, STATE_NAMES)
+    turned.joints[0] = replace(turned.joints[0], sign=-1)
+    assert keep_offsets(turned, before) == [joint.joint for joint in before.joints[1:]]
+    longer = make_arm(so101_like().links, STATE_NAMES)
+    longer.links[1] = replace(longer.links[1], origin=random_pose(generator(0)).tolist())
+    assert keep_offsets(longer, before) == []
+    assert keep_offsets(make_arm(so101_like().links, STATE_NAMES), None) == []
 
 
 # --- cameras --------------------------------------------------------------------------------------------------------------

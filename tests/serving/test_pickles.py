@@ -330,6 +330,20 @@ def attack(messages: int) -> tuple[int, int]:
     return refused, peak
 
 
+def test_a_tensor_in_the_place_of_a_shape_is_refused():
+    content = io.BytesIO()
+    torch.save(torch.tensor([1.0, 2.0]).storage(), content, _use_new_zipfile_serialization=False)
+    data = content.getvalue()
+
+    def name(module: str, kind: str) -> bytes:
+        return b"".join(b"\x8c" + bytes([len(text)]) + text.encode() for text in (module, kind)) + b"\x93"
+
+    storage = name("torch.storage", "_load_from_bytes") + b"B" + len(data).to_bytes(4, "little") + data + b"\x85R"
+    array = name("numpy.core.multiarray", "_reconstruct") + name("numpy", "ndarray") + storage + b"C\x01b\x87R."
+    with pytest.raises(RequestError):
+        read_pickle(b"\x80\x04" + array, LIMITS)
+
+
 def test_mutated_pickles_are_read_or_refused():
     refused, peak = attack(1_000)
     assert 500 < refused < 1_000

@@ -1,6 +1,7 @@
 """The way back: what is exported is LeRobot's π0.5, and what was converted comes back bit for bit."""
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_policy_pi05_geometry.checkpoint.conversion import GeometryStart, convert, export
 from tests.entry_points import GEOMETRY, chunk_of, make_batch, make_policy, make_processors, without
+from tests.geometry.da3.tiny import write_tiny
 
 from .sources import EMBEDDING, EXPERT_HEAD, ONLY_0_6_2, VLM_HEAD, folder_contents, lerobot_chunk, write_lerobot
 
@@ -97,3 +99,15 @@ def test_what_is_no_checkpoint_of_ours_is_refused(tmp_path):
     with pytest.raises(ValueError, match="of type 'pi05', not 'pi05_geometry'"):
         export(tmp_path / "source", tmp_path / "output")
     assert folder_contents(tmp_path) == {"source"}
+
+
+def test_an_export_needs_no_depth_anything_3(tmp_path):
+    """It drops geometry, so it does not look for its encoder."""
+    encoder = write_tiny(tmp_path / "encoder" / "model.safetensors").parent
+    policy = make_policy(geometry_source="da3", da3_encoder=str(encoder), da3_image_size=42, calibration={})
+    policy.save_pretrained(tmp_path / "trained")
+    for pipeline in make_processors(policy.config):
+        pipeline.save_pretrained(tmp_path / "trained")
+    shutil.rmtree(encoder)
+    export(tmp_path / "trained", tmp_path / "exported")
+    assert (tmp_path / "exported" / WEIGHTS).is_file()
