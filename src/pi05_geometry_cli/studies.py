@@ -53,6 +53,12 @@ def study(
         Path | None, typer.Option("--dataset.root", help="Your own LeRobotDataset instead of the simulator.")
     ] = None,
     dataset_repo_id: Annotated[str, typer.Option("--dataset.repo_id", help="Its id.")] = "local/dataset",
+    pi05: Annotated[
+        str | None,
+        typer.Option(
+            help="Own data: the π0.5 to start from (folder or hub id), converted for each arm; none trains from scratch."
+        ),
+    ] = None,
     arms: Annotated[str, typer.Option(help="Own data: arms, with commas.")] = "blind,rgb,random,geometry",
     seeds: Annotated[str, typer.Option(help="Own data: training seeds, with commas.")] = "0,1,2",
     steps: Annotated[int, typer.Option(help="Own data: training steps of every run.")] = 3000,
@@ -87,14 +93,15 @@ def study(
         options = _forwarded(context.args)
         numbers = [int(seed) for seed in seeds.split(",")]
         runs = held_out_runs(
-            output, dataset_root, dataset_repo_id, arms.split(","), numbers, options, steps, held_out, frames
+            output, dataset_root, dataset_repo_id, arms.split(","), numbers, options, steps, held_out, frames, pi05
         )
         if workers is None and options.get("policy.device", "cpu") != "cpu":
             workers = 1  # one run at a time on an accelerator
         _execute(runs, workers, retry_crashed)
         wait_for(runs)
         _print_crashed(runs)
-        command = " ".join(["pi05-geometry study", f"--dataset.root={dataset_root}", *context.args])
+        start = [] if pi05 is None else [f"--pi05 {pi05}"]
+        command = " ".join(["pi05-geometry study", f"--dataset.root={dataset_root}", *start, *context.args])
         path = write_held_out_report(output, runs, command) if rank() == 0 else None
     if path is not None:
         console.print(f"Open [bold]{path}[/bold]")

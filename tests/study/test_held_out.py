@@ -1,5 +1,6 @@
 """A study on a user's own dataset: what is held out, what is compared, and what comes out."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pandas as pd
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from safetensors.torch import load_file
 
 from lerobot_policy_pi05_geometry.checkpoint.load import LoadedPolicy
 from lerobot_policy_pi05_geometry.sim.record import record
@@ -19,9 +21,12 @@ from lerobot_policy_pi05_geometry.study.held_out import (
     hide_depth,
     view_conditions,
 )
+from lerobot_policy_pi05_geometry.study.warm_start import geometry_start
 from tests import commands
+from tests.checkpoint.conversion.sources import write_lerobot
 
 pytestmark = pytest.mark.sim
+OPTIONS = {"policy.device": "cpu", "policy.n_action_steps": "4", "batch_size": "4"}
 FRONT_DEPTH, WRIST_DEPTH = "observation.images.front_depth", "observation.images.wrist_depth"
 
 
@@ -89,7 +94,7 @@ def test_only_arms_that_measure_depth_get_its_augmentation(root, tmp_path):
     options = {f"policy.depth_augmentation.{name}": "0.01" for name in ("noise", "shift")}
     kept = {"geometry": {"noise", "shift"}, "camera-frame": {"noise"}, "rgb": set(), "random": set(), "blind": set()}
     for run in held_out_runs(tmp_path, root, "local/mine", list(kept), [0], options, 4, 0.2, 3):
-        given = [a for a in run.arguments(tmp_path / "run") if "depth_augmentation" in a]
+        given = [a for a in run.arguments(tmp_path / "run", tmp_path / "start") if "depth_augmentation" in a]
         assert {a.partition("=")[0].rpartition(".")[2] for a in given} == kept[run.arm_name]
 
 
@@ -112,3 +117,33 @@ def test_a_study_of_a_dataset_end_to_end(root, tmp_path):
     assert len(table) == (1 + 1 + 2) * 2 * 4 * 4  # views, episodes, steps ahead, dimensions
     geometry = table[table["arm"] == "geometry"].set_index("condition")["error"]
     assert not np.allclose(geometry[ALL_CAMERAS], geometry[NO_DEPTH])
+
+
+@pytest.mark.train
+def test_every_arm_can_start_from_a_pi05(root, tmp_path):
+    """It is converted for each arm, as a user does it, and the conversion is gone afterwards."""
+    pi05, output = write_lerobot(tmp_path / "pi05"), tmp_path / "study"
+    arguments = [
+        "study", f"--dataset.root={root}", "--output", str(output), "--pi05", str(pi05), "--arms=rgb,geometry", "--seeds=0",
+        "--steps=2", "--held-out=0.4", "--frames=3", "--policy.device=cpu", "--policy.n_action_steps=4", "--batch_size=4",
+    ]  # fmt: skip
+    commands.run("pi05_geometry_cli.__main__", *arguments)
+    assert f"--pi05 {pi05}" in (output / "report.html").read_text()
+    weights = load_file(pi05 / "model.safetensors")
+    for run in held_out_runs(output, root, "local/dataset", ["rgb", "geometry"], [0], OPTIONS, 2, 0.4, 3, str(pi05)):
+        assert not run.missing()
+        assert not run.start.exists()
+        trained = load_file(run.checkpoint / "model.safetensors")
+        frozen = "model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
+        assert (trained[frozen] - weights[frozen].float()).abs().max() < 1e-2  # two small steps from where it began
+        assert any("geometry" in name for name in trained) == (run.arm_name == "geometry")
+
+
+def test_an_own_grid_is_converted_to_and_not_given_twice(root, tmp_path):
+    (run,) = held_out_runs(
+        tmp_path, root, "local/mine", ["geometry"], [0], {"policy.geometry_grid": "4"}, 2, 0.4, 3, "pi05"
+    )
+    assert not any("geometry_grid" in argument for argument in run.arguments(tmp_path, tmp_path))
+    assert geometry_start(run._options(), ["front"]).grid == 4
+    other = replace(run, pi05="another")
+    assert other.folder != run.folder != replace(run, pi05=None).folder

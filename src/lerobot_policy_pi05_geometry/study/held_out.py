@@ -6,6 +6,7 @@ predicted.
 """
 
 import math
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +27,7 @@ from ..geometry.keys import DEPTH_SUFFIX, depth_features, find_depth_key, is_dep
 from .arms import DEPTH, blind_inputs, find_arm
 from .runs import ReportProgress, Run, option_list, versions
 from .training import train_with
+from .warm_start import make_start, remaining_options
 
 ALL_CAMERAS, NO_DEPTH, ONLY = "all-cameras", "no-depth", "only-"
 _NOISE_SEED = 0  # the noise that a chunk starts from depends on the episode only, so it is the same for every arm
@@ -36,7 +38,8 @@ class HeldOutRun(Run):
     """An arm on a user's dataset.
 
     dataset_root, repo_id: the dataset. options: further options of lerobot-train. held_out: share of each task's
-    episodes, the last ones, for evaluation only. frames: evaluated frames of each held-out episode, evenly spaced.
+    episodes, the last ones, for evaluation only. frames: evaluated frames of each held-out episode, evenly spaced. pi05: the
+    π0.5 that it starts from, converted for the arm, a folder or hub id; None trains from scratch.
     """
 
     dataset_root: Path
@@ -45,6 +48,7 @@ class HeldOutRun(Run):
     training_steps: int
     held_out: float
     frames: int
+    pi05: str | None = None
 
     @property
     def name(self) -> str:
@@ -63,7 +67,8 @@ class HeldOutRun(Run):
         meta = self.dataset_root / "meta"
         return {
             "arm": self.arm_name,
-            "arguments": self.arguments(Path("output")),
+            "arguments": self.arguments(Path("output"), Path("start")),
+            "pi05": self.pi05,
             "dataset": [(meta / name).read_text() for name in ("info.json", "stats.json")],
             "versions": versions("lerobot_policy_pi05_geometry", "lerobot", "torch"),
         }
@@ -74,23 +79,38 @@ class HeldOutRun(Run):
     def distinct_conditions(self) -> list[str]:
         return list(self.conditions) if DEPTH in self.arm.reads else [ALL_CAMERAS]
 
+    @property
+    def start(self) -> Path:
+        """The converted checkpoint that it starts from, while it is needed: at the released size it takes gigabytes."""
+        return self.folder / "start"
+
     def prepare(self, report_progress: ReportProgress) -> None:
-        """Nothing to prepare: the dataset exists."""
+        """Convert the π0.5 that it starts from. The dataset exists."""
+        if self.pi05 is not None and not self.checkpoint.exists():
+            make_start(
+                self.pi05, self.start, self._options(), depth_cameras(self.dataset_root, self.repo_id), self.seed
+            )
 
     def train(self, output: Path) -> None:
         videos = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).video_keys
-        train_with(self.arguments(output), in_memory=not videos)
+        train_with(self.arguments(output, self.start), in_memory=not videos)
+        shutil.rmtree(self.start, ignore_errors=True)
 
-    def arguments(self, output: Path) -> list[str]:
-        """lerobot-train's arguments. The arm's options and the study's settings override the user's options."""
+    def arguments(self, output: Path, start: Path) -> list[str]:
+        """lerobot-train's arguments. start: the converted π0.5, if there is one.
+
+        The arm's options and the study's settings override the user's options.
+        """
+        options = self._options()
+        if self.pi05 is None:
+            begin: dict[str, Any] = {"policy.type": "pi05_geometry", **options}
+        else:
+            begin = {"policy.path": start, **remaining_options(options)}
         return option_list(
             {
-                "policy.type": "pi05_geometry",
+                **begin,
                 "policy.push_to_hub": "false",
-                "num_workers": 0,
-                **self._users_options(),
-                **self.arm.options,
-                **self._blind_inputs(),
+                "num_workers": options.get("num_workers", 0),
                 "dataset.repo_id": self.repo_id,
                 "dataset.root": self.dataset_root,
                 "dataset.eval_split": self.held_out,
@@ -101,6 +121,9 @@ class HeldOutRun(Run):
                 "output_dir": output,
             }
         )
+
+    def _options(self) -> dict[str, str]:
+        return {**self._users_options(), **self.arm.options, **self._blind_inputs()}
 
     def _users_options(self) -> dict[str, str]:
         """The user's options, without augmentation of depth for arms that measure none, or none in the base frame."""
@@ -157,6 +180,7 @@ def from_json(content: dict[str, Any]) -> HeldOutRun:
         content["training_steps"],
         content["held_out"],
         content["frames"],
+        content["pi05"],
     )
 
 
@@ -170,9 +194,11 @@ def held_out_runs(
     steps: int,
     held_out: float,
     frames: int,
+    pi05: str | None = None,
 ) -> list[HeldOutRun]:
     """Every run of a study on a user's dataset, seed by seed.
 
+    pi05: the π0.5 to start from, folder or hub id; None trains from scratch.
     Raises FileNotFoundError if there is no dataset, and ValueError if arms or settings do not fit it.
     """
     require_dataset(dataset_root)
@@ -190,7 +216,7 @@ def held_out_runs(
     return [
         HeldOutRun(
             output.absolute(), arm, seed, tuple(views), dataset_root.absolute(), repo_id, tuple(options.items()), steps,
-            held_out, frames,
+            held_out, frames, pi05,
         )
         for seed in seeds
         for arm in arms
@@ -199,9 +225,14 @@ def held_out_runs(
 
 def view_conditions(root: Path, repo_id: str) -> list[str]:
     """Conditions for an arm with depth: all depth cameras, each one alone, and none."""
-    cameras = sorted(depth_features(LeRobotDatasetMetadata(repo_id, root=root).features, {}))
+    cameras = depth_cameras(root, repo_id)
     single = [f"{ONLY}{camera}" for camera in cameras] if len(cameras) > 1 else []
     return [ALL_CAMERAS, *single, NO_DEPTH] if cameras else [ALL_CAMERAS]
+
+
+def depth_cameras(root: Path, repo_id: str) -> list[str]:
+    """The dataset's cameras with depth, sorted by name."""
+    return sorted(depth_features(LeRobotDatasetMetadata(repo_id, root=root).features, {}))
 
 
 def hide_depth(batch: dict[str, Any], condition: str, depth_keys: Mapping[str, str]) -> dict[str, Any]:

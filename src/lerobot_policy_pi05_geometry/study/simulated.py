@@ -110,7 +110,7 @@ class SimulatedRun(Run):
     def prepare(self, report_progress: ReportProgress) -> None:
         self.recording.make(report_progress)
         if self.origin is not None:
-            make_start(self.origin.pi05, self.start, self.arm, self.simulated.views, self.seed)
+            make_start(self.origin.pi05, self.start, self.arm.options, self.simulated.views, self.seed)
 
     def train(self, output: Path) -> None:
         train_with(self.arguments(output))
