@@ -107,7 +107,7 @@ def convert(
         float | None, typer.Option(help="Of the gate at the start: 1e-7 is shut, 1 open.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration file. Default: the training data's meta/calibration.json.")
+        Path | None, typer.Option(help="Calibration file. Default: what the training data carries.")
     ] = None,
     features_from_data: Annotated[
         bool, typer.Option("--features-from-data", help="Cameras and state as the training data names them.")

@@ -76,10 +76,16 @@ def libero_floors(
 def libero_report(
     folder: Annotated[Path, typer.Argument(help="Folder that lerobot-eval wrote (its --output_dir).")],
     placement: Placement = "stock",
+    floors: Annotated[
+        Path | None, typer.Option(help="File of libero-floors. Default: the floors of this package.")
+    ] = None,
 ) -> None:
     """Success per task of a lerobot-eval on LIBERO, with intervals and floors; written to report.md too."""
+    from lerobot_policy_pi05_geometry.sim.libero.floors import FLOORS_FILE
     from lerobot_policy_pi05_geometry.sim.libero.report import read_results, report
 
-    text = report(read_results(folder, placement), placement)
+    if floors is not None and not floors.is_file():
+        raise typer.BadParameter(f"{floors}: no such file.")
+    text = report(read_results(folder, placement, floors or FLOORS_FILE), placement)
     (folder / "report.md").write_text(text)
     console.print(text, markup=False)

@@ -198,14 +198,13 @@ def test_the_report_counts_each_task_and_the_suite(tmp_path):
     assert "| libero_goal/1 | 0/10 | 0% to 28% | not measured | not measured |" in text
 
 
-def test_a_floor_of_another_placement_is_not_shown(tmp_path, monkeypatch):
+def test_a_floor_of_another_placement_is_not_shown(tmp_path):
     floor = Floor("libero_goal", 8, "t", "near", 50, 49, 20, 4, 100, 2.0)
-    monkeypatch.setattr(
-        "lerobot_policy_pi05_geometry.sim.libero.report.read_floors", lambda: {("libero_goal", 8, "near"): floor}
-    )
+    file = tmp_path / "floors.json"
+    write_floors([floor], file)
     folder = eval_info(tmp_path, {8: [True]})
-    assert "4/20 | 49/50" in report(read_results(folder, "near"), "near")
-    assert "4/20" not in report(read_results(folder, "stock"), "stock")
+    assert "4/20 | 49/50" in report(read_results(folder, "near", file), "near")
+    assert "4/20" not in report(read_results(folder, "stock", file), "stock")
 
 
 def test_a_folder_without_an_outcome_is_refused(tmp_path):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from scipy.stats import binomtest
 
-from .floors import Floor, read_floors
+from .floors import FLOORS_FILE, Floor, read_floors
 from .tasks import PLACEMENTS
 
 EVAL_INFO = "eval_info.json"
@@ -34,15 +34,18 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def read_results(folder: Path, placement: str) -> list[TaskResult]:
-    """Results per task of a folder that lerobot-eval wrote. Raises FileNotFoundError or ValueError in one sentence."""
+def read_results(folder: Path, placement: str, floors_file: Path = FLOORS_FILE) -> list[TaskResult]:
+    """Results per task of a folder that lerobot-eval wrote, with the floors of a file that `libero-floors` wrote.
+
+    Raises FileNotFoundError or ValueError in one sentence.
+    """
     if placement not in PLACEMENTS:
         raise ValueError(f"There is no placement '{placement}'; choose one of: {', '.join(PLACEMENTS)}.")
     file = Path(folder) / EVAL_INFO
     if not file.is_file():
         raise FileNotFoundError(f"{file} is not there; give the --output_dir of a lerobot-eval that has ended.")
     content = json.loads(file.read_text())
-    floors, results = read_floors(), []
+    floors, results = read_floors(floors_file), []
     try:
         for entry in content["per_task"]:
             suite, index, successes = entry["task_group"], int(entry["task_id"]), entry["metrics"]["successes"]
