@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 FLOORS_FILE = Path(__file__).parent / "floors.json"
 FIRST_SEED = 700_000  # apart from evaluation (0) and recording (1,000,000)
-SETTLING_STEPS = 20  # an object that was let go comes to rest in 1 s; then an episode without success has failed
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ def measure(
 
 def _run(scene: "LiberoScene", seed: int, placement: str, memory: "Memory | None") -> int | None:
     """Steps until an expert (with a memory: a blind plan) reaches the goal, or None."""
-    from .expert.expert import Expert
+    from .expert.expert import SETTLING_STEPS, Expert
 
     scene.reset(seed, placement)
     expert = Expert(scene, memory)

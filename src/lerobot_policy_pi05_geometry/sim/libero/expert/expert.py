@@ -10,6 +10,7 @@ from .skills import LIFT, Style, pick, place, pull, twist
 from .world import Memory, World
 
 KNOB_TURN = 1.1  # radians; the stove is on from 0.5
+SETTLING_STEPS = 20  # an object that was let go comes to rest in 1 s
 
 
 class Expert:
@@ -47,7 +48,11 @@ class Expert:
         world, hand, style = self.world, self.hand, self._style
         if _is_drawer(where) and not _is_open(world, where):
             yield from pull(hand, world, _drawer_body(where), style)
-        for _ in range(2 if world.looks else 1):
+        for attempt in range(2 if world.looks else 1):
+            for _ in range(
+                SETTLING_STEPS if attempt else 0
+            ):  # the episode may be won: an object that was let go still moves
+                yield hand.still()
             origin = world.position(name)
             yield from pick(hand, world, name, style)
             held = hand.position - (world.position(name) if world.looks else origin + np.array([0.0, 0.0, LIFT]))
