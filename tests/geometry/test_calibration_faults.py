@@ -11,6 +11,8 @@ from lerobot_policy_pi05_geometry.geometry.placed_camera import PlacedCamera
 from lerobot_policy_pi05_geometry.geometry.rigid import FARTHEST, identity_rows
 
 from ..entry_points import (
+    FRONT,
+    FRONT_DEPTH,
     WRIST_POSE,
     make_batch,
     make_calibration,
@@ -29,18 +31,30 @@ def placed(size: tuple[int, int], rotation: int = 0) -> PlacedCamera:
 
 @pytest.mark.parametrize("size", [(480, 640), (240, 320), (84, 112), (63, 84), (53, 70), (10, 13)])
 def test_a_view_that_is_only_resized_is_taken(size):
-    placed(size)
-    placed(size[::-1], rotation=90)
+    placed(size).check_view()
+    placed(size[::-1], rotation=90).check_view()
 
 
 @pytest.mark.parametrize("size", [(640, 480), (480, 848), (224, 224), (360, 640)])
 def test_images_of_another_shape_than_the_calibration_are_refused(size):
     """They were turned, cropped or squeezed: no scale makes these intrinsics theirs."""
     with pytest.raises(ValueError, match=r"Images of camera 'front' are .* its calibration is of 640 x 480"):
-        placed(size)
+        placed(size).check_view()
     if size != (640, 480):
         with pytest.raises(ValueError, match="another shape"):
-            placed(size[::-1], rotation=90)
+            placed(size[::-1], rotation=90).check_view()
+
+
+def test_depth_of_another_shape_is_refused_by_the_policy_and_rgb_behind_rays_is_not():
+    """A π0.5 declares 224 x 224 for RGB, whatever arrives, and rays through cells depend on no size."""
+    inputs, _ = make_features()
+    inputs[FRONT_DEPTH] = PolicyFeature(FeatureType.VISUAL, (1, 24, 18))
+    with pytest.raises(ValueError, match="another shape"):
+        make_policy(input_features=inputs)
+    square = make_features()[0] | {FRONT: PolicyFeature(FeatureType.VISUAL, (3, 20, 20))}
+    rays = make_policy(geometry_source="rays", input_features=square).eval().geometry.source(make_observation(1))
+    expected = make_policy(geometry_source="rays").eval().geometry.source(make_observation(1))
+    torch.testing.assert_close(rays.features, expected.features, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

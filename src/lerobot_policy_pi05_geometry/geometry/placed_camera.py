@@ -17,15 +17,13 @@ class PlacedCamera:
     """A camera and where it stands. rigs: by id; data of one rig has one. size: (H, W) of its images, of depth or of colour.
 
     Frames differ in rig only if the data says so (`observation.calibration.rig`); `only` is the rig of a robot whose observations
-    do not. Raises ValueError for images of another shape than the calibration's.
+    do not.
     """
 
     def __init__(self, name: str, rigs: Mapping[int, Rig], size: tuple[int, int], only: int | None = None) -> None:
         self.name, self.only = name, only
         self.ids = sorted(rigs)
         self.cameras: Sequence[CameraCalibration] = [rigs[number].cameras[name].as_recorded() for number in self.ids]
-        for camera in self.cameras:
-            camera.check_view(name, *size)
         self._turns = [rigs[number].cameras[name].rotation for number in self.ids]
         self.kinematics = [
             None
@@ -35,6 +33,14 @@ class PlacedCamera:
         ]
         self._size = size
         self._at: dict[torch.device, tuple[Tensor, Tensor, Tensor, Tensor]] = {}
+
+    def check_view(self) -> None:
+        """Raise ValueError if the images have another shape than the calibration of a rig.
+
+        For depth, whose size is the data's. Camera rays depend on no size, and a checkpoint may declare another one for RGB.
+        """
+        for camera in self.cameras:
+            camera.check_view(self.name, *self._size)
 
     @property
     def on_arm(self) -> bool:

@@ -52,6 +52,8 @@ class RgbdSource(GeometrySource):
         super().__init__()
         self.cameras, self.grid = tuple(camera.name for camera in placed), grid
         self.placed = {camera.name: camera for camera in placed}
+        for camera in placed:
+            camera.check_view()
         self.bounds, self.optional = dict(bounds or {}), frozenset(optional)
         self.feature_dim, self.points = depth_features(as_points)
         self.sizes, self.base_frame, self.unit, self.max_depth = dict(sizes), base_frame, unit, max_depth

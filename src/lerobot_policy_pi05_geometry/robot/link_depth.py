@@ -147,6 +147,7 @@ def check_link_depth(dataset: LeRobotDataset, rig: Rig, camera: str, arm_name: s
     bounds = codec_bounds(features, [camera], depth_keys).get(camera, (0.0, np.inf))
     height, width = (side for side in features[key]["shape"] if side != 1)
     placed = PlacedCamera(camera, {0: rig}, (height, width))
+    placed.check_view()
     if not placed.placed:
         raise ValueError(f"Camera '{camera}' has no pose; find it with `pi05-geometry calibrate hand-eye`.")
     shape = ArmShape(model, rig.arms[arm_name])
