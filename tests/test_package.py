@@ -131,7 +131,7 @@ def test_the_readmes_python_runs(tmp_path):
     redraw(package.PI05GeometryPolicy(config)).save_pretrained(tmp_path)
     preprocess.save_pretrained(tmp_path)
     postprocess.save_pretrained(tmp_path)
-    code = code.replace("outputs/train/last/pretrained_model", str(tmp_path)).replace('"cuda"', '"cpu"')
+    code = code.replace("outputs/train/.../checkpoints/last/pretrained_model", str(tmp_path)).replace('"cuda"', '"cpu"')
     assert FRONT in code
     assert FRONT_DEPTH in code
     assert STATE in code

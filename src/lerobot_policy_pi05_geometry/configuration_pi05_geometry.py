@@ -284,8 +284,7 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
         """
         inputs = dict(self.input_features or {})
         # A camera that is declared absent later keeps its place among the image tokens.
-        if super().image_features:
-            self.image_order = list(self.image_features)
+        self._record_image_order()
         for key, feature in list(inputs.items()):
             if is_geometry_key(key, self.depth_keys) and not _is_rgb(key, feature):
                 self.geometry_features[key] = inputs.pop(key)
@@ -308,6 +307,7 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
         if OBS_STATE not in inputs:
             inputs[OBS_STATE] = PolicyFeature(type=FeatureType.STATE, shape=(self.max_state_dim,))
         self.input_features = inputs
+        self._record_image_order()
         self.output_features = dict(self.output_features or {})
         if ACTION not in self.output_features:
             self.output_features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(self.max_action_dim,))
@@ -355,6 +355,12 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
         found = {**super().image_features, **self.optional_cameras}
         known = [key for key in self.image_order if key in found]
         return {key: found[key] for key in dict.fromkeys([*known, *found])}
+
+    def _record_image_order(self) -> None:
+        """Keep the order of the cameras' tokens, once there are cameras."""
+        keys = list(self.image_features)
+        if any(not key.startswith(EMPTY_CAMERA) for key in keys):
+            self.image_order = keys
 
     def may_be_absent(self, image_key: str) -> bool:
         """Whether observations may lack this RGB camera."""

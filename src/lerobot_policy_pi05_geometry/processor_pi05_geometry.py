@@ -55,7 +55,7 @@ def make_pi05_geometry_pre_post_processors(
             ),
             NormaliserProbeStep(),
             steps.normalize,
-            NormaliserScaleStep(constant=constant_of(config.normalization_mapping["STATE"].value)),
+            NormaliserScaleStep(constant=constant_of(config.normalization_mapping.get("STATE"))),
             PromptProcessorStep(),
             tokenizer,
             steps.to_device,

@@ -100,7 +100,7 @@ def test_an_adapted_arm_trains_nothing_of_its_own(runs):
 
 @pytest.mark.parametrize("arm", ["grid-4", "pooled"])
 def test_what_defines_new_weights_is_decided_by_the_conversion(arm, runs, tmp_path):
-    make_start(runs["pretraining"].pi05, tmp_path / "start", ARMS[arm], ("front",), seed=0)
+    make_start(runs["pretraining"].pi05, tmp_path / "start", ARMS[arm].options, ("front",), seed=0)
     config = PreTrainedConfig.from_pretrained(tmp_path / "start")
     given = {name.removeprefix("policy."): value for name, value in ARMS[arm].options.items()}
     assert {name: str(getattr(config, name)) for name in given} == given

@@ -27,9 +27,9 @@ PROBE = (
 NO_WIDTH = 5e7  # a scale above it comes from LeRobot's eps of 1e-8 in place of a width
 
 
-def constant_of(mode: str | None) -> float:
-    """What LeRobot's normaliser makes of the constant of a dimension without width, by its mode (NormalizationMode's value)."""
-    return 0.0 if mode == NormalizationMode.MEAN_STD.value else -1.0
+def constant_of(mode: NormalizationMode | str | None) -> float:
+    """What LeRobot's normaliser makes of the constant of a dimension without width, by its mode or the mode's value."""
+    return 0.0 if mode in (NormalizationMode.MEAN_STD, NormalizationMode.MEAN_STD.value) else -1.0
 
 
 @ProcessorStepRegistry.register(name="pi05_geometry_normaliser_probe")

@@ -63,7 +63,9 @@ def depth_figure(policy: PI05GeometryPolicy, batch: Mapping[str, Tensor]) -> Fig
         if key is not None:
             raw = batch[key][:1].cpu()
             placed = source.placed[camera]
-            factor = placed.depth_factor(placed.rows({name: value[:1] for name, value in batch.items()}), raw.device)
+            factor = placed.depth_factor(
+                placed.rows({name: value[:1] for name, value in batch.items() if isinstance(value, Tensor)}), raw.device
+            )
             bounds = source.bounds.get(camera, (0.0, math.inf))
             depth, valid = to_metres(
                 raw, camera, policy.config.depth_unit, size, policy.config.max_depth, factor, bounds
