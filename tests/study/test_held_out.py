@@ -147,3 +147,14 @@ def test_an_own_grid_is_converted_to_and_not_given_twice(root, tmp_path):
     assert geometry_start(run._options(), ["front"]).grid == 4
     other = replace(run, pi05="another")
     assert other.folder != run.folder != replace(run, pi05=None).folder
+
+
+def test_a_pi05_that_was_trained_on_is_another_one(root, tmp_path):
+    pi05 = tmp_path / "pi05"
+    pi05.mkdir()
+    folders = []
+    for content in ("one", "two, longer"):
+        (pi05 / "model.safetensors").write_text(content)
+        (run,) = held_out_runs(tmp_path, root, "local/mine", ["geometry"], [0], {}, 2, 0.4, 3, str(pi05))
+        folders.append(run.folder)
+    assert folders[0] != folders[1]

@@ -10,14 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from .rigid import as_matrix, compose
+from .rigid import as_matrix
 
 STREAMS = ("depth", "color")
 FOCAL_LENGTHS = (0.1, 20.0)  # in image sides: from a field of view of 157 degrees to one of 3
 CENTRES = (-1.0, 2.0)  # of the optical axis, in image sides: a cropped image may have it outside
-SQUEEZE = (
-    1.03  # a factor by which images may be wider or higher than the calibration's size says: sizes are whole pixels
-)
+# A factor by which images may be wider or higher than the calibration's size says: sizes are whole pixels.
+SQUEEZE = 1.03
 ROTATIONS = (0, 90, 180, 270)  # degrees clockwise, as LeRobot's cameras have it (270 is its -90)
 
 
@@ -135,17 +134,16 @@ class CameraCalibration:
         return replace(turned, rotation=0)
 
 
-def pose_of_images(pose: torch.Tensor, rotation: int) -> torch.Tensor:
-    """The pose (..., 4, 4) of images that were turned by `rotation` degrees clockwise, from the sensor's."""
-    for _ in range(rotation // 90):
-        pose = compose(pose, _SENSOR_T_TURNED.to(pose))
-    return pose
-
-
 # Camera axes of an image turned clockwise by a quarter: its x axis is the sensor's -y, its y axis the sensor's x.
 _SENSOR_T_TURNED = torch.tensor(
     [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64
 )
+
+
+def sensor_T_images(rotation: int) -> list[list[float]]:  # noqa: N802
+    """Pose in the sensor's frame of images that were turned by `rotation` degrees clockwise, 4 rows of 4."""
+    rows: list[list[float]] = torch.linalg.matrix_power(_SENSOR_T_TURNED, rotation // 90).tolist()
+    return rows
 
 
 def pose_of_sensor(pose: np.ndarray, rotation: int) -> np.ndarray:

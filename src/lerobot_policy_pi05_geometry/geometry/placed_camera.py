@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from .calibration import Rig
-from .camera import CameraCalibration, pose_of_images
+from .camera import CameraCalibration, sensor_T_images
 from .depth import LEROBOT_COUNT
 from .keys import RAW_STATE, RIG, batch_like
 from .kinematics import ForwardKinematics
@@ -24,7 +24,7 @@ class PlacedCamera:
         self.name, self.only = name, only
         self.ids = sorted(rigs)
         self.cameras: Sequence[CameraCalibration] = [rigs[number].cameras[name].as_recorded() for number in self.ids]
-        self._turns = [rigs[number].cameras[name].rotation for number in self.ids]
+        self._rotations = [rigs[number].cameras[name].rotation for number in self.ids]
         self.kinematics = [
             None
             if camera.mount is None
@@ -32,7 +32,7 @@ class PlacedCamera:
             for number, camera in zip(self.ids, self.cameras, strict=True)
         ]
         self._size = size
-        self._at: dict[torch.device, tuple[Tensor, Tensor, Tensor, Tensor]] = {}
+        self._at: dict[torch.device, tuple[Tensor, Tensor, Tensor, Tensor, Tensor]] = {}
 
     def check_view(self) -> None:
         """Raise ValueError if the images have another shape than the calibration of a rig.
@@ -59,9 +59,9 @@ class PlacedCamera:
         """
         if len(self.ids) == 1:
             return None
-        if RIG not in batch and self.only is not None:
-            return torch.tensor([self.ids.index(self.only)], device=batch_like(batch).device)
         if RIG not in batch:
+            if self.only is not None:
+                return torch.tensor([self.ids.index(self.only)], device=batch_like(batch).device)
             raise ValueError(
                 f"The policy was trained on data of several rigs ({', '.join(map(str, self.ids))}), and the "
                 f"observation has no {RIG}; "
@@ -100,7 +100,7 @@ class PlacedCamera:
 
     def poses(self, batch: Mapping[str, Tensor], rows: Tensor | None, device: torch.device) -> Tensor:
         """`base_T_camera`, (4, 4) or (B, 4, 4), by the calibration and, for a camera on an arm, by the raw state."""
-        _, _, fixed, mounts = self._constants(device)
+        _, _, fixed, mounts, _ = self._constants(device)
         if not self.on_arm:
             return fixed[0] if rows is None else fixed.index_select(0, rows)
         state = batch[RAW_STATE].to(device).float()
@@ -117,16 +117,14 @@ class PlacedCamera:
 
     def frame_poses(self, pose: Tensor, rows: Tensor | None) -> Tensor:
         """`base_T_camera` of images as they arrive, from poses of the sensor, (B, 4, 4) or (4, 4), that came with the frames."""
-        if not any(self._turns):
+        if not any(self._rotations):
             return pose
-        by_rig = torch.stack([pose_of_images(pose, turn) for turn in self._turns])  # (R, ..., 4, 4)
-        if rows is None:
-            return by_rig[0]
-        rows = rows.to(pose.device)
-        return by_rig[rows] if pose.ndim == 2 else by_rig[rows.expand(len(pose)), torch.arange(len(pose))]
+        turns = self._constants(pose.device)[4]
+        return compose(pose, (turns[0] if rows is None else turns.index_select(0, rows.to(pose.device))).to(pose.dtype))
 
-    def _constants(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Intrinsics (R, 4), factors (R,), `base_T_camera` and `link_T_camera` (R, 4, 4), NaN where there is none.
+    def _constants(self, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Intrinsics (R, 4), factors (R,), `base_T_camera` and `link_T_camera` (R, 4, 4), NaN where there is none, and
+        `sensor_T_images` (R, 4, 4).
 
         Kept, since a copy to a GPU blocks.
         """
@@ -136,6 +134,7 @@ class PlacedCamera:
             factors = [1.0 if c.depth_scale is None else c.depth_scale / LEROBOT_COUNT for c in self.cameras]
             fixed = [nowhere if c.extrinsics is None else c.extrinsics for c in self.cameras]
             mounts = [nowhere if c.mount is None else c.mount.link_T_camera for c in self.cameras]
-            made = [torch.tensor(values, device=device) for values in (intrinsics, factors, fixed, mounts)]
-            self._at[device] = (made[0], made[1], made[2], made[3])
+            turns = [sensor_T_images(rotation) for rotation in self._rotations]
+            made = [torch.tensor(values, device=device) for values in (intrinsics, factors, fixed, mounts, turns)]
+            self._at[device] = (made[0], made[1], made[2], made[3], made[4])
         return self._at[device]

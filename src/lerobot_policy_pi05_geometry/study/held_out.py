@@ -68,7 +68,7 @@ class HeldOutRun(Run):
         return {
             "arm": self.arm_name,
             "arguments": self.arguments(Path("output"), Path("start")),
-            "pi05": self.pi05,
+            "pi05": None if self.pi05 is None else _description_of(self.pi05),
             "dataset": [(meta / name).read_text() for name in ("info.json", "stats.json")],
             "versions": versions("lerobot_policy_pi05_geometry", "lerobot", "torch"),
         }
@@ -207,6 +207,8 @@ def held_out_runs(
     for name in arms:
         if find_arm(name).cameras != "train" or find_arm(name).adapts is not None:
             raise ValueError(f"Arm '{name}' needs other camera poses in its data, which only the simulator has.")
+    if pi05 is not None and Path(pi05).is_dir():
+        pi05 = str(Path(pi05).absolute())
     views = view_conditions(dataset_root, repo_id)
     if len(views) == 1 and any(DEPTH in find_arm(name).reads for name in arms):
         raise ValueError(
@@ -228,6 +230,12 @@ def view_conditions(root: Path, repo_id: str) -> list[str]:
     cameras = depth_cameras(root, repo_id)
     single = [f"{ONLY}{camera}" for camera in cameras] if len(cameras) > 1 else []
     return [ALL_CAMERAS, *single, NO_DEPTH] if cameras else [ALL_CAMERAS]
+
+
+def _description_of(checkpoint: str) -> list[Any]:
+    """What a checkpoint is known by: its name and, of a folder, the sizes and times of its files."""
+    files = sorted(Path(checkpoint).glob("*.*")) if Path(checkpoint).is_dir() else []
+    return [checkpoint, *((file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files)]
 
 
 def depth_cameras(root: Path, repo_id: str) -> list[str]:

@@ -204,3 +204,12 @@ def test_an_export_writes_the_tokenizers_files_only(converted, tmp_path):
     with pytest.raises(ValueError, match="A saved tokenizer has the files"):
         export(source, tmp_path / "output")
     assert not outside.exists()
+
+
+@pytest.mark.parametrize(("ours", "constant"), [([], 0.0), ([{}], -1.0), ([{"constant": 0.0}], 0.0)])
+def test_a_policy_of_ours_keeps_the_constant_that_it_was_trained_with(ours, constant):
+    """Of a state dimension without width under MEAN_STD: 0 for LeRobot's π0.5, -1 in ours of an earlier version."""
+    steps = [{"registry_name": "normalizer_processor", "config": {"norm_map": {"STATE": "MEAN_STD"}}}]
+    steps += [{"registry_name": "pi05_geometry_normaliser_scale", "config": config} for config in ours]
+    scale = [s for s in preprocessor_to_ours(steps) if s.get("registry_name") == "pi05_geometry_normaliser_scale"]
+    assert [step["config"] for step in scale] == [{"constant": constant}]

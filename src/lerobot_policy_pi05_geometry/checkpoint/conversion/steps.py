@@ -21,7 +21,8 @@ RELATIVE, ABSOLUTE = (
 _NORMALIZER, _UNNORMALIZER = "normalizer_processor", "unnormalizer_processor"
 _WIDTH = "pi05_geometry_state_width"
 _RAW_STATE = "pi05_geometry_raw_state"
-_OURS_ALONE = (_WIDTH, _RAW_STATE, "pi05_geometry_normaliser_probe", "pi05_geometry_normaliser_scale")
+_SCALE = "pi05_geometry_normaliser_scale"
+_OURS_ALONE = (_WIDTH, _RAW_STATE, "pi05_geometry_normaliser_probe", _SCALE)
 
 
 def step_name(step: Step) -> str:
@@ -36,11 +37,17 @@ def preprocessor_to_ours(steps: list[Step]) -> list[Step]:
     result = []
     for step in steps:
         if step_name(step) == _NORMALIZER:
-            scale = NormaliserScaleStep(constant=constant_of(step.get("config", {}).get("norm_map", {}).get("STATE")))
-            result += [*map(_saved, [*before, NormaliserProbeStep()]), step, _saved(scale)]
+            result += [*map(_saved, [*before, NormaliserProbeStep()]), step, _saved(_scale_step(steps, step))]
         elif step_name(step) not in (*_OURS_ALONE, RELATIVE):
             result.append(step)
     return result
+
+
+def _scale_step(steps: list[Step], normaliser: Step) -> NormaliserScaleStep:
+    """The step after a normaliser: with the constant that a policy of ours was trained with, else with LeRobot's."""
+    if any(step_name(step) == _SCALE for step in steps):
+        return NormaliserScaleStep(**_settings(steps, _SCALE))
+    return NormaliserScaleStep(constant=constant_of(normaliser.get("config", {}).get("norm_map", {}).get("STATE")))
 
 
 def postprocessor_to_ours(steps: list[Step]) -> list[Step]:

@@ -49,9 +49,8 @@ class Expert:
         if _is_drawer(where) and not _is_open(world, where):
             yield from pull(hand, world, _drawer_body(where), style)
         for attempt in range(2 if world.looks else 1):
-            for _ in range(
-                SETTLING_STEPS if attempt else 0
-            ):  # the episode may be won: an object that was let go still moves
+            # The episode may be won: an object that was let go still moves.
+            for _ in range(SETTLING_STEPS if attempt else 0):
                 yield hand.still()
             origin = world.position(name)
             yield from pick(hand, world, name, style)
