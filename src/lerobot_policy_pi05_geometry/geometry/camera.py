@@ -8,7 +8,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from .rigid import as_matrix
 
@@ -135,21 +134,20 @@ class CameraCalibration:
 
 
 # Camera axes of an image turned clockwise by a quarter: its x axis is the sensor's -y, its y axis the sensor's x.
-_SENSOR_T_TURNED = torch.tensor(
-    [[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64
-)
+# In NumPy, since the planner builds cameras where torch's tensors hold no values.
+_SENSOR_T_TURNED = np.array([[0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def sensor_T_images(rotation: int) -> list[list[float]]:  # noqa: N802
     """Pose in the sensor's frame of images that were turned by `rotation` degrees clockwise, 4 rows of 4."""
-    rows: list[list[float]] = torch.linalg.matrix_power(_SENSOR_T_TURNED, rotation // 90).tolist()
+    rows: list[list[float]] = np.linalg.matrix_power(_SENSOR_T_TURNED, rotation // 90).tolist()
     return rows
 
 
 def pose_of_sensor(pose: np.ndarray, rotation: int) -> np.ndarray:
     """The sensor's pose (4, 4) from that of its images, which were turned by `rotation` degrees clockwise."""
     for _ in range(rotation // 90):
-        pose = pose @ _SENSOR_T_TURNED.mT.numpy()
+        pose = pose @ _SENSOR_T_TURNED.T
     return pose
 
 
@@ -160,12 +158,13 @@ def _quarter_turn(intrinsics: list[float], size: list[int]) -> list[float]:
 
 
 def _times_turn(pose: list[list[float]]) -> list[list[float]]:
-    return (torch.tensor(pose, dtype=torch.float64) @ _SENSOR_T_TURNED).tolist()
+    turned: list[list[float]] = (np.array(pose) @ _SENSOR_T_TURNED).tolist()
+    return turned
 
 
 def _turned_color(color: ColorStream) -> ColorStream:
     k1, k2, p1, p2, k3 = color.distortion
-    depth_T_color = _SENSOR_T_TURNED.mT @ torch.tensor(color.depth_T_color, dtype=torch.float64) @ _SENSOR_T_TURNED
+    depth_T_color = _SENSOR_T_TURNED.T @ np.array(color.depth_T_color) @ _SENSOR_T_TURNED
     return ColorStream(
         _quarter_turn(color.intrinsics, color.size),
         color.size[::-1],
