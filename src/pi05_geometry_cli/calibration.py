@@ -160,6 +160,10 @@ def hand_eye(
         bool, typer.Option("--fixed", help="The camera stands still, and the arm carries the board.")
     ] = False,
     arm: Annotated[str, typer.Option(help="The arm's name in the calibration.")] = "arm",
+    keep_offsets: Annotated[
+        bool,
+        typer.Option("--keep-offsets", help="Find only the camera; the arm's joints keep the offsets in the file."),
+    ] = False,
     board: BoardText = DEFAULT_BOARD,
     file: File = Path("calibration.json"),
     picture: Annotated[Path, typer.Option(help="PNG to write: what all cameras see, in the base frame.")] = Path(
@@ -175,10 +179,10 @@ def hand_eye(
     from lerobot_policy_pi05_geometry.inspect.inspection import frame_batch
     from lerobot_policy_pi05_geometry.inspect.scene import scene_figure, scene_of
     from lerobot_policy_pi05_geometry.robot.board import Board
-    from lerobot_policy_pi05_geometry.robot.calibrate import calibrate_hand_eye
+    from lerobot_policy_pi05_geometry.robot.calibrate import calibrate_hand_eye, cameras_on_arm
 
     changed, found = calibrate_hand_eye(
-        dataset_root, dataset_repo_id, _read(file), camera, arm, link, Board.parse(board), not fixed
+        dataset_root, dataset_repo_id, _read(file), camera, arm, link, Board.parse(board), not fixed, keep_offsets
     )
     write_calibration_file(file, changed)
     scene = scene_of(
@@ -196,9 +200,24 @@ def hand_eye(
         f"degrees; joints were off "
         f"by {np.degrees(found.deviation):.2f} degrees. Four times as many poses leave half of it."
     )
+    if keep_offsets:
+        console.print(
+            f"The joints of '{arm}' kept their offsets. Wrote [bold]{file}[/bold]; look at [bold]{picture}[/bold]."
+        )
+        return
     for joint, offset in found.offsets.items():
-        told = "0 by convention" if joint in found.fixed_joints else f"{np.degrees(offset):+.2f} degrees"
+        told = (
+            "as it was, by convention"
+            if joint in found.fixed_joints
+            else f"changed by {np.degrees(offset):+.2f} degrees"
+        )
         console.print(f"  offset of {joint}: {told}")
+    others = cameras_on_arm(changed, arm, other_than=camera)
+    if others:
+        console.print(
+            f"{', '.join(others)}: placed with the offsets that the arm had before; run pi05-geometry calibrate hand-eye again "
+            "for what the arm carries, with --keep-offsets."
+        )
     console.print(
         f"No recording can tell the offset of {found.fixed_joints[0]} from a turn of the base, nor that of "
         f"{found.fixed_joints[1]} from a "

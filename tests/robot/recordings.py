@@ -78,15 +78,22 @@ class Recording:
         inside = ((pixels > 5) & (pixels < np.array(SIZE) - 5)).all(axis=2) & (points[..., 2] > 0.1)
         return pixels, inside & (facing > math.cos(math.radians(60)))[:, None]
 
-    def draw(self, count: int, reach: float = 1.0, pixel_noise: float = 0.3, joint_noise: float = 0.2) -> list[View]:
+    def draw(
+        self,
+        count: int,
+        reach: float = 1.0,
+        pixel_noise: float = 0.3,
+        joint_noise: float = 0.2,
+        motion: tuple[float, ...] = (70, 60, 70, 70, 90),
+    ) -> list[View]:
         """Views with half of the board or more in the image. The state is off by offsets and noise (degrees).
 
-        reach: of the poses.
+        reach: of the poses. motion: of each joint to both sides of its middle, degrees.
         """
         found: list[np.ndarray] = []
         for _ in range(200):
             drawn = self.random.uniform(-1, 1, (500, 5))
-            values = self.middle + np.radians([70, 60, 70, 70, 90]) * reach * drawn
+            values = self.middle + np.radians(motion) * reach * drawn
             found.extend(values[self.project(values)[1].sum(axis=1) >= len(BOARD.corners) // 2])
             if len(found) >= count:
                 break

@@ -12,7 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from typer.testing import CliRunner
 
 from lerobot_policy_pi05_geometry.geometry.calibration import Calibration, read_calibration_file, write_calibration_file
-from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, ColorStream, pose_of_sensor
+from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, ColorStream, Mount, pose_of_sensor
 from lerobot_policy_pi05_geometry.geometry.kinematics import Arm, ForwardKinematics
 from lerobot_policy_pi05_geometry.robot import realsense
 from lerobot_policy_pi05_geometry.robot.board import Board
@@ -240,17 +240,14 @@ def test_the_commands_calibrate_a_fixed_camera(tmp_path):
         return result.output
 
     assert "elbow_flex.pos" in run("arm", f"--model={tmp_path / 'arm.urdf'}", root)
-    told = run(
-        "hand-eye",
-        "--camera=front",
-        "--link=gripper",
-        "--fixed",
-        "--board=7x5:30:22",
-        root,
-        f"--picture={tmp_path / 'scene.png'}",
-    )
+    carried = replace(camera, mount=Mount("arm", "gripper", np.eye(4).tolist()))
+    arms = read_calibration_file(file).arms
+    write_calibration_file(file, Calibration({"front": camera, "wrist": carried}, arms))
+    options = ("--camera=front", "--link=gripper", "--fixed", "--board=7x5:30:22", root)
+    told = run("hand-eye", *options, f"--picture={tmp_path / 'scene.png'}")
     assert "held out" in told
-    assert "0 by convention" in told
+    assert "as it was, by convention" in told
+    assert "wrist: placed with the offsets that the arm had before" in told
     assert (tmp_path / "scene.png").stat().st_size > 1000
     found = read_calibration_file(file)
     millimetres, degrees = aligned_errors(recording, np.array(found.cameras["front"].extrinsics))
@@ -259,6 +256,15 @@ def test_the_commands_calibrate_a_fixed_camera(tmp_path):
     offsets = np.array([joint.offset for joint in found.arms["arm"].joints[:5]])
     assert np.abs(offsets - recording.offsets)[1:4].max() < np.radians(1.0)
     assert json.loads(file.read_text())["version"] == 2
+
+    told = run("hand-eye", *options, "--keep-offsets", f"--picture={tmp_path / 'scene.png'}")
+    assert "kept their offsets" in told
+    assert "placed with the offsets" not in told
+    again = read_calibration_file(file)
+    assert again.arms == found.arms
+    assert (
+        np.abs(np.array(again.cameras["front"].extrinsics) - np.array(found.cameras["front"].extrinsics)).max() < 2e-3
+    )
 
 
 def test_depth_of_a_board_that_is_ten_times_too_far_is_an_error():

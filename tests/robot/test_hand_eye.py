@@ -60,6 +60,21 @@ def test_twenty_noisy_views_calibrate_a_camera(wrist):
     assert degrees <= 0.2
 
 
+def test_with_offsets_that_are_known_joints_may_stand_still():
+    """The arm's offsets stay, and a joint that never moves is no reason to refuse the recording."""
+    recording = make_recording(True, 4)
+    recording.offsets[:] = 0.0
+    views = recording.draw(20, pixel_noise=0.0, joint_noise=0.0, motion=(70, 0, 70, 70, 90))
+    with pytest.raises(ValueError, match="shoulder_lift moved by less than"):
+        solve(recording, views)
+    found = solve(recording, views, keep_offsets=True)
+    assert set(found.offsets.values()) == {0.0}
+    assert found.fixed_joints == tuple(recording.kinematics.joints)
+    millimetres, degrees = aligned_errors(recording, found.camera)
+    assert millimetres < 0.2
+    assert degrees < 0.02
+
+
 @pytest.mark.parametrize("wrist", [False, True], ids=["fixed", "wrist"])
 def test_errors_are_what_the_noise_leaves(wrist):
     """No method can do better from these views, and what the command says of the noise is true: by Mahalanobis distances.

@@ -86,11 +86,20 @@ def state_names(dataset: LeRobotDataset) -> list[str]:
 
 
 def calibrate_hand_eye(
-    root: Path, repo_id: str, calibration: Calibration, camera: str, arm_name: str, link: str, board: Board, wrist: bool
+    root: Path,
+    repo_id: str,
+    calibration: Calibration,
+    camera: str,
+    arm_name: str,
+    link: str,
+    board: Board,
+    wrist: bool,
+    keep_offsets: bool = False,
 ) -> tuple[Calibration, HandEye]:
     """A calibration with this camera's pose and the arm's joint offsets, and how good they are.
 
-    link: that carries the camera (wrist), or the board (fixed camera). Raises ValueError with one sentence.
+    link: that carries the camera (wrist), or the board (fixed camera). keep_offsets: the arm keeps the offsets that it has.
+    Raises ValueError with one sentence.
     """
     if camera not in calibration.cameras:
         raise ValueError(
@@ -111,7 +120,9 @@ def calibrate_hand_eye(
     views = find_views(dataset, image_key, kinematics, board)
     stream = image_stream(of_camera, camera, dataset.meta.features.get(image_key, {}).get("shape"))
     check_board_depth(dataset, camera, of_camera, stream, views, board)
-    found = solve_hand_eye(kinematics, views, board, stream.intrinsics, stream.distortion, wrist)
+    found = solve_hand_eye(
+        kinematics, views, board, stream.intrinsics, stream.distortion, wrist, keep_offsets=keep_offsets
+    )
     pose = pose_of_sensor(found.camera @ stream.stream_T_depth, of_camera.rotation)
     placed = (
         replace(of_camera, extrinsics=None, mount=Mount(arm_name, link, pose.tolist()))
@@ -124,6 +135,12 @@ def calibrate_hand_eye(
     )
     changed.check()
     return changed, found
+
+
+def cameras_on_arm(calibration: Calibration, arm: str, other_than: str) -> list[str]:
+    """Cameras that this arm carries: their poses follow from its joints' offsets."""
+    carried = [name for name, camera in calibration.cameras.items() if camera.mount and camera.mount.arm == arm]
+    return [name for name in carried if name != other_than]
 
 
 def image_stream(camera: CameraCalibration, name: str, shape: list[int] | None) -> ImageStream:

@@ -36,7 +36,7 @@ class HandEye:
     offsets: radians per joint of the chain, added to what they were. deviation: root mean square of what the joints were
     off, radians.
     image: pixels that remain when joints may be off. fitted: of all views. held_out: of views that a first fit did not have.
-    fixed_joints: whose offsets stay as they were, by convention. views: frames of the dataset.
+    fixed_joints: whose offsets stay as they were, by convention or because they were to be kept. views: frames of the dataset.
     """
 
     camera: np.ndarray
@@ -48,7 +48,7 @@ class HandEye:
     fitted: Residuals
     held_out: Residuals
     views: list[int]
-    fixed_joints: tuple[str, str]
+    fixed_joints: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -68,19 +68,22 @@ def solve_hand_eye(
     distortion: list[float],
     wrist: bool,
     start: np.ndarray | None = None,
+    keep_offsets: bool = False,
 ) -> HandEye:
-    """Calibrate a camera from views of a board. start: of `HandEye.camera`, tried besides OpenCV's.
+    """Calibrate a camera from views of a board. start: of `HandEye.camera`, tried besides OpenCV's. keep_offsets: of the arm.
 
     Raises ValueError with one sentence for views that are too few, too alike or contradict each other.
     """
     seen = np.stack([board_pose(board, view.seen, intrinsics, distortion) for view in views]) if views else None
-    check_views(kinematics, views, seen)
+    check_views(kinematics, views, seen, keep_offsets)
     assert seen is not None
 
     def part(held_out: bool) -> tuple[HandEyeProblem, np.ndarray]:
         rows = [i for i in range(len(views)) if (i % HOLD_OUT == HOLD_OUT - 1) == held_out]
         chosen = [views[i] for i in rows]
-        return HandEyeProblem(kinematics, chosen, board.corners, intrinsics, distortion, wrist), seen[rows]
+        return HandEyeProblem(kinematics, chosen, board.corners, intrinsics, distortion, wrist, keep_offsets), seen[
+            rows
+        ]
 
     problem, of_images = part(held_out=False)
     measured = fit(problem, _best_start(problem, of_images, start)).found
@@ -89,7 +92,7 @@ def solve_hand_eye(
         raise ValueError(reason)
     held_problem, of_held_images = part(held_out=True)
     # What is returned is fitted to all views; how good that is was measured without every fifth.
-    whole = HandEyeProblem(kinematics, views, board.corners, intrinsics, distortion, wrist)
+    whole = HandEyeProblem(kinematics, views, board.corners, intrinsics, distortion, wrist, keep_offsets)
     unmoved = replace(measured, deviations=torch.zeros_like(whole.values))
     solution = fit(whole, unmoved)
     spread = _spread(whole, solution.covariance)
@@ -99,7 +102,7 @@ def solve_hand_eye(
         found.camera.numpy(), found.board.numpy(), dict(zip(kinematics.joints, found.offsets.tolist(), strict=True)),
         deviation_of(found), image_error(whole, found), spread, residuals_of(whole, found, seen),
         residuals_of(held_problem, measured, of_held_images), [view.frame for view in views],
-        (kinematics.joints[0], kinematics.joints[-1]),
+        tuple(joint for joint, free in zip(kinematics.joints, whole.free.tolist(), strict=True) if not free),
     )  # fmt: skip
 
 

@@ -53,7 +53,8 @@ class Unknowns:
 class HandEyeProblem:
     """Predicted and seen corners of some views. wrist: the camera moves and the board lies still, or the other way round.
 
-    intrinsics: fx, fy, cx, cy of the images. distortion: OpenCV's five numbers. free: which joints' offsets are unknown.
+    intrinsics: fx, fy, cx, cy of the images. distortion: OpenCV's five numbers. keep_offsets: the arm's are known. free: which
+    joints' offsets are unknown.
     """
 
     more = 0  # how many numbers a kind of problem has besides
@@ -66,6 +67,7 @@ class HandEyeProblem:
         intrinsics: list[float],
         distortion: list[float],
         wrist: bool,
+        keep_offsets: bool = False,
     ) -> None:
         self.kinematics, self.wrist, self.views = kinematics, wrist, views
         self.intrinsics, self.distortion = torch.tensor(intrinsics).double(), torch.tensor(distortion).double()
@@ -75,7 +77,7 @@ class HandEyeProblem:
         points = np.concatenate([corners[view.seen.ids] for view in views])
         self.points = torch.from_numpy(np.concatenate([points, np.ones((len(points), 1))], axis=1))  # (N, 4)
         joints = len(kinematics.joints)
-        self.free = torch.tensor([0 < number < joints - 1 for number in range(joints)])
+        self.free = torch.tensor([0 < number < joints - 1 and not keep_offsets for number in range(joints)])
 
     def start(self, camera: np.ndarray, board: np.ndarray) -> Unknowns:
         """Unknowns with these poses, and every joint where it says it is."""

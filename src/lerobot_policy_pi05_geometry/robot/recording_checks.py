@@ -20,8 +20,13 @@ MAX_OFFSET_SPREAD = 1.5  # degrees
 MAX_POSE_SPREAD = 6.0, 1.5  # millimetres, degrees
 
 
-def check_views(kinematics: ForwardKinematics, views: list[View], seen: np.ndarray | None) -> None:
-    """Raise ValueError for views that are too few or too alike, and for a joint that never moved. seen: `camera_T_board`."""
+def check_views(
+    kinematics: ForwardKinematics, views: list[View], seen: np.ndarray | None, keep_offsets: bool = False
+) -> None:
+    """Raise ValueError for views that are too few or too alike, and for a joint that never moved. seen: `camera_T_board`.
+
+    keep_offsets: joints may stand still, since their offsets are known.
+    """
     if len(views) < MIN_VIEWS or seen is None:
         raise ValueError(
             f"The board was found in {len(views)} distinct views, but {MIN_VIEWS} are needed; record some 20 poses with the "
@@ -51,7 +56,7 @@ def check_views(kinematics: ForwardKinematics, views: list[View], seen: np.ndarr
         )
     free = range(1, len(kinematics.joints) - 1)
     still = [kinematics.joints[j] for j in free if spans[j] < MIN_MOTION]
-    if still:
+    if still and not keep_offsets:
         raise ValueError(
             f"Joint(s) {', '.join(still)} moved by less than {np.degrees(MIN_MOTION):.0f} degrees, so nothing says "
             f"what their offset is; "
