@@ -107,6 +107,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self.progress = TrainingProgress()
         self._acted_on = 0  # rows of the last observation; 0 before the first
         self._present: tuple[bool, ...] = ()  # which cameras it had an image of
+        self._told_of_delay = False
         self._noise_seed = torch.initial_seed()
         tokens = 0 if self.geometry is None else self.geometry.source.num_tokens
         self.geometry_log = GeometryLog(self.model.paligemma_with_expert, tokens)
@@ -308,7 +309,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Start an episode, prepared for: see `start_episode` and `warm_up`."""
         self.start_episode()
-        if self._acted_on and not self.training:
+        if (self._acted_on or self.rtc_processor is not None) and not self.training:
             self.warm_up()
 
     def start_episode(self) -> None:
@@ -322,12 +323,13 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         """Prepare for episodes of so many robots (as many as acted last, at first one): no chunk then waits for a preparation.
 
         Where chunks are recorded (on a GPU), one is recorded for every length that a prompt can have. `reset` calls this from the
-        second episode on; call it after loading for a fast first one. It changes no action and draws no random number.
+        second episode on, with real-time chunking from the first; call it after loading for a fast first one. It changes no
+        action and draws no random number.
         """
         config = self.config
         shapes = ChunkShapes(
             batch=batch_size or self._acted_on or 1,
-            present=self._present or (True,) * len(config.image_features),
+            present=self._present or tuple(not key.startswith(EMPTY_CAMERA) for key in config.image_features),
             side=config.image_resolution[0],
             geometry_tokens=0 if self.geometry is None else self.geometry.source.num_tokens,
             geometry_width=self.model.geometry_width,
@@ -367,6 +369,12 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self._acted_on = len(batch[OBS_LANGUAGE_TOKENS])
         if kwargs.get("prev_chunk_left_over") is not None:
             kwargs |= without_padding(kwargs["prev_chunk_left_over"], kwargs.get("inference_delay"))
+            if (
+                self.model.rtc_enabled
+                and self.model.rtc_mode == "trained"
+                and kwargs["prev_chunk_left_over"] is not None
+            ):
+                kwargs["inference_delay"] = self._hard_prefix_length(**kwargs)
         anchor = anchor_of(batch, self.config.use_relative_actions)  # (B, A)
         if anchor is not None and kwargs.get("prev_chunk_left_over") is not None:
             kwargs["prev_chunk_left_over"] = relative_to(anchor, kwargs["prev_chunk_left_over"])
@@ -385,6 +393,25 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         )
         actions = actions[..., : self.config.action_feature.shape[0]]
         return actions if anchor is None else actions + anchor[:, None].to(actions)
+
+    def _hard_prefix_length(
+        self, prev_chunk_left_over: Tensor, inference_delay: int | None = None, **_: Any
+    ) -> int | None:
+        """The delay, or fewer steps, if training knew only shorter prefixes or fewer are left. Warns once.
+
+        LeRobot gives the longest delay that it has ever met, so one slow chunk must not end real-time chunking.
+        """
+        longest = min(self.config.rtc_training_max_delay, prev_chunk_left_over.shape[-2])
+        if inference_delay is None or inference_delay <= longest:
+            return inference_delay
+        if not self._told_of_delay:
+            logger.warning(
+                "inference_delay is %d, but only %d steps can be given to this chunk (rtc_training_max_delay=%d, %d steps left "
+                "over); those are. Where chunks are late again and again, act at a lower rate or use rtc_mode=guided.",
+                inference_delay, longest, self.config.rtc_training_max_delay, prev_chunk_left_over.shape[-2],
+            )  # fmt: skip
+        self._told_of_delay = True
+        return longest
 
     def _measure(self, batch: dict[str, Tensor]) -> GeometryTokens:
         assert self.geometry is not None

@@ -1,6 +1,7 @@
 """The policy on a robot: chunks, the action queue, failing cameras, real-time chunking."""
 
 import math
+import threading
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 
 from lerobot_policy_pi05_geometry import compat
 from lerobot_policy_pi05_geometry.data.images import prepare_images
+from lerobot_policy_pi05_geometry.inference.cuda_graphs import GraphRunner
 from lerobot_policy_pi05_geometry.inference.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
 from tests.entry_points import (
@@ -214,13 +216,32 @@ def test_what_is_left_over_must_fit(runner):
     policy = make_rtc_policy(rtc_mode="trained", rtc_training_max_delay=3)
     for left, delay, says in [
         (torch.ones(1, 5, ACTION_DIM), None, "needs inference_delay"),
-        (torch.ones(1, 5, ACTION_DIM), 4, "trained with rtc_training_max_delay=3"),
-        (torch.ones(1, 2, ACTION_DIM), 3, "has only 2 steps"),
         (torch.ones(1, CHUNK + 1, ACTION_DIM), 1, r"T <= \d+ and A <= 8, got"),
         (torch.ones(3, 5, ACTION_DIM), 1, "B = 1"),
     ]:
         with pytest.raises(ValueError, match=says):
             policy.predict_action_chunk(make_batch(1), prev_chunk_left_over=left, inference_delay=delay, runner=runner)
+
+
+@pytest.mark.parametrize("runner", ["fast", "plain"])
+@pytest.mark.parametrize(("left", "delay", "kept"), [(5, 9, 3), (2, 3, 2)])
+def test_one_late_chunk_does_not_end_trained_real_time_chunking(runner, left, delay, kept, caplog):
+    """LeRobot gives the longest delay that it ever met, and may cut what is left below it."""
+    policy = make_rtc_policy(rtc_mode="trained", rtc_training_max_delay=3)
+    noise, left_over = torch.randn(1, CHUNK, 8), torch.randn(1, left, ACTION_DIM)
+
+    def chunk(delay: int) -> torch.Tensor:
+        return policy.predict_action_chunk(
+            make_batch(1), noise=noise, prev_chunk_left_over=left_over, inference_delay=delay, runner=runner
+        )
+
+    expected = chunk(kept)
+    assert not caplog.records
+    assert torch.equal(chunk(delay), expected)
+    assert torch.equal(chunk(delay), expected)
+    assert [
+        record.message.startswith(f"inference_delay is {delay}, but only {kept} steps") for record in caplog.records
+    ] == [True]
 
 
 def test_the_mode_must_be_one_the_policy_was_trained_for():
@@ -308,6 +329,52 @@ def test_after_a_warm_up_no_prompt_is_recorded_in_an_episode():
         policy.predict_action_chunk(batch | text, noise=noise)
     assert policy.sampler.explain()["CUDA graphs"] == told
     assert torch.equal(policy.predict_action_chunk(batch, noise=noise), before)
+
+
+def test_with_real_time_chunking_the_first_chunk_is_recorded_before_the_episode():
+    policy = record(make_rtc_policy(tokenizer_max_length=70, empty_cameras=1))
+    policy.reset()
+    told = policy.sampler.explain()["CUDA graphs"]
+    assert told.startswith("active: 3 of")
+    policy.predict_action_chunk(make_batch(1))
+    policy.predict_action_chunk(make_batch(1), prev_chunk_left_over=torch.ones(4, ACTION_DIM), inference_delay=1)
+    assert policy.sampler.explain()["CUDA graphs"] == told
+
+
+def test_a_reset_records_nothing_again(monkeypatch):
+    """Also for prompts that need more recordings than are kept otherwise."""
+    policy = record(make_policy(tokenizer_max_length=300))
+    policy.predict_action_chunk(make_batch(1))
+    policy.reset()
+    recorder = policy.sampler._runners[GraphRunner]._recorder
+    count = len(recorder.tapes)
+    assert count >= 20  # ten lengths, two halves each
+    with monkeypatch.context() as patch:
+        patch.setattr(policy.sampler, "_chunk", lambda *_, **__: pytest.fail("a chunk was computed to warm up again"))
+        policy.reset()
+    policy.predict_action_chunk(make_batch(1))
+    assert len(recorder.tapes) == count
+
+
+def test_a_reset_while_a_chunk_is_computed_does_not_change_it():
+    """LeRobot resets a policy while its thread for real-time chunking predicts; both use the recorded chunk's buffers."""
+    policy = record(make_policy(tokenizer_max_length=32))
+    batch, noise = make_batch(1), torch.randn(1, CHUNK, 8)
+    expected = policy.predict_action_chunk(batch, noise=noise).clone()
+    measure, reset = (
+        policy._measure,
+        threading.Thread(target=lambda: (policy.reset(), policy.predict_action_chunk(make_batch(1, 9)))),
+    )
+
+    def measure_slowly(batch):
+        if not reset.ident:
+            reset.start()
+            reset.join(0.5)
+        return measure(batch)
+
+    policy._measure = measure_slowly
+    assert torch.equal(policy.predict_action_chunk(batch, noise=noise), expected)
+    reset.join()
 
 
 @pytest.mark.parametrize("changes", [{"empty_cameras": 1}, {"absent_cameras": [WRIST]}])

@@ -9,11 +9,11 @@
 A recorded graph reads and writes fixed addresses. So inputs have buffers of their own, what the graphs compute (the cache among
 it) stays where it was recorded, and nothing is allocated. All graphs share the memory of their intermediates, since no two run at
 the same time. Prompts are padded to a multiple of `PROMPT_STEP` tokens: up to 200 tokens make 7 shapes, which all fit into
-`CAPACITY`. When it is full, the shape that was not used for longest is dropped.
+`CAPACITY`. When it is full, the shape that was not used for longest is dropped; `reserve` makes it larger.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import torch
@@ -27,6 +27,7 @@ from ..model.segments import GeometryTokens
 from .backend import Backend
 from .recorder import Recorder
 from .runner import ChunkFunctions, ChunkRunner, ChunkSettings, Observation, observation_key
+from .side_stream import PendingGeometry
 
 CAPACITY = 8  # shapes of inputs that stay recorded
 PROMPT_STEP = 32  # tokens
@@ -63,10 +64,29 @@ class GraphRunner(ChunkRunner):
         more = -tokens.shape[1] % PROMPT_STEP
         return super().__call__(images, img_masks, F.pad(tokens, (0, more)), F.pad(masks, (0, more)), *args, **kwargs)
 
+    def reserve(self, shapes: int) -> None:
+        """Keep so many shapes of inputs or more."""
+        self.capacity = max(self.capacity, shapes)
+
+    def has_recorded(
+        self,
+        images: Sequence[Tensor | None],
+        img_masks: Sequence[Tensor],
+        tokens: Tensor,
+        masks: Tensor,
+        noise: Tensor,
+        geometry: PendingGeometry | None = None,
+    ) -> bool:
+        """Whether a chunk of these shapes, with the policy's number of denoising steps and nothing left over, is recorded."""
+        more = -tokens.shape[1] % PROMPT_STEP
+        observation = Observation(images, img_masks, F.pad(tokens, (0, more)), F.pad(masks, (0, more)))
+        previous = self._previous_chunk(noise, None, None, None)
+        return _key(observation, noise, previous, self._settings(noise, None, geometry)) in self.recorded
+
     def _functions(
         self, observation: Observation, noise: Tensor, previous: Guidance | HardPrefix | None, settings: ChunkSettings
     ) -> ChunkFunctions:
-        key = (*observation_key(*tree_leaves((observation, noise, previous))), settings)
+        key = _key(observation, noise, previous, settings)
         if key not in self.recorded:
             self._drop_oldest()
             plain = super()._functions(observation, noise, previous, settings)
@@ -75,7 +95,7 @@ class GraphRunner(ChunkRunner):
         return self.recorded[key]
 
     def _drop_oldest(self) -> None:
-        if len(self.recorded) == self.capacity:
+        if len(self.recorded) >= self.capacity:
             self.recorded.popitem(last=False)
         if not self.recorded:  # shared memory is freed with the last graph in it, and cannot be shared again
             self._recorder = self.backend.new_recorder()
@@ -100,6 +120,12 @@ class GraphRunner(ChunkRunner):
             self._recorder, lambda *inputs: chunk.denoise(prefill.result, *inputs), noise, late, previous
         )
         return ChunkFunctions(prefill, lambda context, *inputs: denoise(*inputs).clone())
+
+
+def _key(
+    observation: Observation, noise: Tensor, previous: Guidance | HardPrefix | None, settings: ChunkSettings
+) -> Hashable:
+    return (*observation_key(*tree_leaves((observation, noise, previous))), settings)
 
 
 def _tensors(tree: Any) -> list[Tensor]:

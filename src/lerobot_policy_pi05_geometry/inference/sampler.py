@@ -2,6 +2,7 @@
 
 import inspect
 import logging
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -38,6 +39,9 @@ class ChunkSampler(nn.Module):
     - by `refresh()`. Call it after a write that PyTorch does not count: through `parameter.data`, or by a fused optimiser while
       the network stayed in evaluation mode.
 
+    Chunks are computed one at a time, also if several threads ask: a recorded chunk has one set of buffers, and LeRobot resets a
+    policy while its thread for real-time chunking predicts.
+
     network: not a submodule of the sampler. backend: makes what the runner has to know of a device.
     """
 
@@ -47,6 +51,7 @@ class ChunkSampler(nn.Module):
         self._make_backend = backend
         self._runners: dict[type[ChunkRunner], ChunkRunner] = {}
         self._reported: str | None = None
+        self._one_at_a_time = threading.RLock()
 
     def __reduce__(self) -> tuple:
         """A copy builds its own runner: recorded graphs cannot be copied."""
@@ -83,6 +88,10 @@ class ChunkSampler(nn.Module):
 
     def forward(self, *observation: Any, runner: RunnerName = "fast", **kwargs: Any) -> Tensor:
         """An action chunk (B, S, D); arguments as in `ChunkRunner.__call__` or `PI05Pytorch.sample_actions`."""
+        with self._one_at_a_time:
+            return self._chunk(*observation, runner=runner, **kwargs)
+
+    def _chunk(self, *observation: Any, runner: RunnerName, **kwargs: Any) -> Tensor:
         given = {name: value for name, value in kwargs.items() if value is not None}
         if runner == "plain":
             return self._plain(*observation, **given)
@@ -109,10 +118,22 @@ class ChunkSampler(nn.Module):
 
     def prepare(self, runner: RunnerName = "fast") -> str | None:
         """Build the runner and its modulations, if they are not there. Returns why the plain path serves instead, or None."""
-        reason = self._unsupported_reason(runner, set())
-        if reason is None:
-            self._runners[self._kind(runner)].compute_flow_times(self._network.config.num_inference_steps)
+        with self._one_at_a_time:
+            reason = "inference_runner=plain" if runner == "plain" else self._unsupported_reason(runner, set())
+            if reason is None:
+                self._runners[self._kind(runner)].compute_flow_times(self._network.config.num_inference_steps)
         return reason
+
+    def reserve(self, shapes: int) -> None:
+        """Keep recorded chunks of so many shapes of inputs or more. Without effect where none are recorded."""
+        for built in self._runners.values():
+            if isinstance(built, GraphRunner):
+                built.reserve(shapes)
+
+    def has_recorded(self, *observation: Any, noise: Tensor, geometry: PendingGeometry | None) -> bool:
+        """Whether a chunk with inputs of these shapes is recorded; arguments as in `GraphRunner.has_recorded`."""
+        built = self._runners.get(GraphRunner)
+        return isinstance(built, GraphRunner) and built.has_recorded(*observation, noise, geometry)
 
     def _unsupported_reason(self, runner: RunnerName, given: set[str]) -> str | None:
         """Why the runner cannot compute this chunk, as the rest of a sentence; if it can, None, and the runner is there."""

@@ -32,9 +32,12 @@ class ChunkShapes(NamedTuple):
 
 @torch.no_grad()
 def warm_up(sampler: ChunkSampler, runner: RunnerName, shapes: ChunkShapes, device: torch.device) -> None:
-    """Build the runner; where it records chunks, record one of every prompt length. Draws no random number."""
-    if not sampler.records(runner):
-        sampler.prepare(runner)
+    """Build the runner; where it records chunks, record one of every prompt length, unless it is there. Draws no random number.
+
+    Nothing is done where the plain path serves.
+    """
+    declined = sampler.prepare(runner) is not None
+    if declined or not sampler.records(runner):
         return
     batch, geometry = shapes.batch, None
     if shapes.geometry_tokens:
@@ -45,7 +48,15 @@ def warm_up(sampler: ChunkSampler, runner: RunnerName, shapes: ChunkShapes, devi
     images = [image if there else None for there in shapes.present]
     masks = [torch.full((batch,), there, device=device) for there in shapes.present]
     noise = torch.zeros(batch, shapes.steps, shapes.action_dim, device=device)
-    for length in range(PROMPT_STEP, shapes.longest_prompt + PROMPT_STEP, PROMPT_STEP):
+    lengths = prompt_lengths(shapes.longest_prompt)
+    sampler.reserve(len(lengths) + 1)
+    for length in lengths:
         text = torch.zeros(batch, length, dtype=torch.int64, device=device)
-        mask = torch.ones_like(text, dtype=torch.bool)
-        sampler(images, masks, text, mask, noise=noise, geometry=geometry, runner=runner)
+        observation = images, masks, text, torch.ones_like(text, dtype=torch.bool)
+        if not sampler.has_recorded(*observation, noise=noise, geometry=geometry):
+            sampler(*observation, noise=noise, geometry=geometry, runner=runner)
+
+
+def prompt_lengths(longest: int) -> range:
+    """Lengths that prompts of at most `longest` tokens are padded to where chunks are recorded."""
+    return range(PROMPT_STEP, longest + PROMPT_STEP, PROMPT_STEP)
