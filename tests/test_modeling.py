@@ -538,3 +538,16 @@ def test_depth_cameras_need_intrinsics():
     calibration["wrist"].intrinsics[0] = 0.0
     with pytest.raises(ValueError, match=r"Intrinsics of camera 'wrist' are singular"):
         make_policy(calibration=calibration)
+
+
+@pytest.mark.parametrize("runner", ["fast", "plain"])
+def test_a_policy_that_is_loaded_in_inference_mode_acts_and_can_be_trained(runner, tmp_path):
+    policy = make_policy()
+    policy.save_pretrained(tmp_path)
+    noise = torch.randn(1, CHUNK, 8)
+    with torch.inference_mode():
+        loaded = PI05GeometryPolicy.from_pretrained(tmp_path)
+        chunk = loaded.predict_action_chunk(make_batch(1), noise=noise, runner=runner)
+    torch.testing.assert_close(chunk, policy.predict_action_chunk(make_batch(1), noise=noise), atol=1e-5, rtol=1e-5)
+    loaded.train()
+    loaded(make_batch(1))[0].backward()

@@ -44,6 +44,11 @@ def mode_of(rtc: RTCConfig | None) -> str | None:
     return getattr(rtc, "mode", None)
 
 
+def rtc_config_of(mode: str) -> RTCConfig:
+    """LeRobot's default real-time chunking in a mode, "guided" or "trained", which 0.6.1's RTCConfig cannot say."""
+    return RTCConfig(mode=mode) if "mode" in RTCConfig.__dataclass_fields__ else RTCConfig()  # type: ignore[call-arg]
+
+
 def make_rtc_processor(rtc: RTCConfig, trained: bool) -> RTCProcessor:
     """LeRobot's processor for real-time chunking. trained: whether the policy can do trained RTC, which 0.6.2 asks for."""
     return RTCProcessor(rtc) if mode_of(rtc) is None else RTCProcessor(rtc, trained_mode_supported=trained)

@@ -126,6 +126,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             network.paligemma.model.multi_modal_projector.requires_grad_(False)
 
     @classmethod
+    @torch.inference_mode(False)  # weights made in inference mode could not be joined for the runner, nor trained
     def from_pretrained(
         cls,
         pretrained_name_or_path: str | Path,

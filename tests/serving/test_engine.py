@@ -1,17 +1,25 @@
 """A served chunk is the local one, alone or in company."""
 
+from dataclasses import dataclass
+from itertools import product
+
 import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 
+from lerobot_policy_pi05_geometry import compat
+from lerobot_policy_pi05_geometry.inference.cuda_graphs import GraphRunner
+from lerobot_policy_pi05_geometry.inference.sampler import ChunkSampler
 from lerobot_policy_pi05_geometry.serving.engine import Job, PolicyEngine, make_job, note_answer
 from lerobot_policy_pi05_geometry.serving.inputs import Inputs
 from lerobot_policy_pi05_geometry.serving.limits import Limits, RequestError
 from lerobot_policy_pi05_geometry.serving.noise import request_noise
 from lerobot_policy_pi05_geometry.serving.session import Session
 from tests.entry_points import ACTION_DIM, CHUNK, WRIST_DEPTH, WRIST_POSE, make_calibration, make_features, without
+from tests.inference.tape import TapeBackend
 
 from .running import load, local_chunk, make_request, observation_of
 
@@ -227,6 +235,54 @@ def test_a_new_episode_computes_one_chunk_and_records_none(monkeypatch):
     for _ in range(2):
         engine.run(jobs_of(loaded, [make_request(0), make_request(1)], sessions), 2)
     assert len(chunks) == 2
+
+
+@pytest.mark.parametrize("continues", [False, True])
+def test_nothing_is_recorded_after_the_warm_up_and_nothing_dropped(continues):
+    """Three sizes, two lengths of prompt, with real-time chunking and without: twelve shapes."""
+    loaded = load(**({"rtc_config": RTCConfig()} if continues else {}))
+    loaded.policy.sampler = ChunkSampler(loaded.policy.model, TapeBackend)
+    engine, inputs = PolicyEngine(loaded), Inputs(loaded.policy.config, Limits())
+    engine.warm(inputs, (1, 2, 4))
+    recorded = loaded.policy.sampler._runners[GraphRunner].recorded
+    assert len(recorded) == (12 if continues else 6)
+    sessions = [Session() for _ in range(4)]
+    for _ in range(2):
+        for guided, words, size in product((False, True), (1, 6), (1, 2, 4)):
+            more = {"inference_delay": 1, "executed_steps": 2} if guided else {}
+            requests = [make_request(0, "warm up " * words) | more for _ in range(size)]
+            jobs = jobs_of(loaded, requests, sessions[:size])
+            for session, job, answer in zip(sessions, jobs, engine.run(jobs, size), strict=False):
+                note_answer(session, job.request, answer)
+        assert len(recorded) == 12
+
+
+@dataclass
+class RTCConfigOfMain(RTCConfig):
+    """LeRobot's main branch has the mode in its configuration."""
+
+    mode: str = "guided"
+
+
+@pytest.mark.parametrize(
+    "changes", [{"rtc_config": RTCConfigOfMain(mode="trained")}, {"rtc_mode": "trained"}], ids=["theirs", "ours"]
+)
+def test_trained_real_time_chunking_stays_so_in_a_server(changes, monkeypatch):
+    monkeypatch.setattr(compat, "RTCConfig", RTCConfigOfMain)
+    monkeypatch.setattr(compat, "RTCProcessor", lambda rtc, trained_mode_supported: RTCProcessor(rtc))
+    loaded = load(rtc_training_max_delay=3, **changes)
+    engine, session, modes = PolicyEngine(loaded), Session(), []
+    forward = loaded.policy.sampler.forward
+    monkeypatch.setattr(
+        loaded.policy.sampler, "forward", lambda *a, **k: modes.append(loaded.policy.model.rtc_mode) or forward(*a, **k)
+    )
+    for more in ({}, {"inference_delay": 2, "executed_steps": 3}):
+        (job,) = jobs_of(loaded, [make_request() | more], [session])
+        (answer,) = engine.run([job], 1)
+        left_over = None if session.chunk is None else session.chunk[3:5]
+        note_answer(session, job.request, answer)
+    assert modes[-1] == "trained"
+    torch.testing.assert_close(answer.chunk[:2], left_over)
 
 
 def test_a_depth_camera_of_any_scale_can_be_warmed_up():

@@ -51,6 +51,7 @@ class ChunkSampler(nn.Module):
         self._make_backend = backend
         self._runners: dict[type[ChunkRunner], ChunkRunner] = {}
         self._reported: str | None = None
+        self._reserved = 0  # shapes of inputs
         self._one_at_a_time = threading.RLock()
 
     def __reduce__(self) -> tuple:
@@ -125,7 +126,8 @@ class ChunkSampler(nn.Module):
         return reason
 
     def reserve(self, shapes: int) -> None:
-        """Keep recorded chunks of so many shapes of inputs or more. Without effect where none are recorded."""
+        """Keep recorded chunks of so many shapes of inputs or more, where they are recorded."""
+        self._reserved = max(self._reserved, shapes)
         for built in self._runners.values():
             if isinstance(built, GraphRunner):
                 built.reserve(shapes)
@@ -152,6 +154,7 @@ class ChunkSampler(nn.Module):
                 self._runners[kind] = kind(self._network, self._make_backend(self._device))
             except UnsupportedLayerError as error:
                 return str(error)
+            self.reserve(self._reserved)
         return None
 
     # --- for a person ---------------------------------------------------------------------------------------------------

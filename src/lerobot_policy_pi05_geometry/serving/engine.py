@@ -3,6 +3,8 @@
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,9 +13,12 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from torch import Tensor
 
 from ..checkpoint.load import LoadedPolicy
+from ..compat import rtc_config_of
+from ..configuration_checks import rtc_mode
 from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..geometry.keys import CALIBRATION_PREFIX, DEPTH_SUFFIX, RIG, camera_of, is_geometry_key
 from ..geometry.resolve import one_metre
+from ..inference.warm_up import prompt_lengths
 from .inputs import Guidance, Inputs, Request
 from .limits import RequestError
 from .noise import request_noise
@@ -85,7 +90,8 @@ class PolicyEngine:
         """guidance: what real-time chunking uses where a request does not say; the checkpoint's by default."""
         self.policy, self.config = loaded.policy.eval(), loaded.policy.config
         self._preprocess, self._postprocess = loaded.preprocess, loaded.postprocess
-        self._guidance = guidance or self.config.rtc_config or RTCConfig()
+        self._continues = self.config.rtc_config is not None or self.config.rtc_training_max_delay > 0
+        self._guidance = guidance or self.config.rtc_config or rtc_config_of(rtc_mode(self.config))
         self._set_guidance(None)
 
     @property
@@ -116,12 +122,18 @@ class PolicyEngine:
         return [Answer(actions[i].numpy().copy(), chunk[i].clone(), spent, len(jobs)) for i in range(len(jobs))]
 
     def warm(self, inputs: Inputs, sizes: Sequence[int]) -> None:
-        """Run every size of batch once with a short and a long instruction, so that kernels are loaded and graphs recorded."""
-        for size in sizes:
-            for words in (1, 6):
-                rig = next(iter(inputs.rigs.ids), None)
-                request = Request(_blank(inputs, self.config, rig), "warm up " * words, None, None, rig)
-                self.run([Job(request, torch.zeros(self.noise_shape), begins=True)], size)
+        """Run every size of batch once with a short and a long instruction, so that kernels are loaded and graphs recorded.
+
+        A checkpoint that is set up or trained for real-time chunking is run with it, too. Nothing that is recorded is dropped:
+        there is a place for every size and length of prompt, with real-time chunking and without.
+        """
+        rig, nothing = next(iter(inputs.rigs.ids), None), torch.zeros(self.noise_shape)
+        self.policy.sampler.reserve(2 * len(sizes) * len(prompt_lengths(self.config.tokenizer_max_length)))
+        left_over = torch.zeros(self.noise_shape[0], self.config.action_feature.shape[0])
+        for size, words in product(sizes, (1, 6)):
+            for guidance in (None, Guidance(0, 0)) if self._continues else (None,):
+                request = Request(_blank(inputs, self.config, rig), "warm up " * words, guidance, None, rig)
+                self.run([Job(request, nothing, True, None if guidance is None else left_over)], size)
         self.policy.start_episode()
 
     @contextmanager
@@ -145,8 +157,10 @@ class PolicyEngine:
         self.config.rtc_config = None
         if guidance is not None:
             given, default = guidance, self._guidance
-            self.config.rtc_config = RTCConfig(
+            self.config.rtc_config = replace(
+                default,
                 enabled=True,
+                debug=False,
                 execution_horizon=given.execution_horizon or default.execution_horizon,
                 max_guidance_weight=given.max_guidance_weight or default.max_guidance_weight,
                 prefix_attention_schedule=given.prefix_attention_schedule or default.prefix_attention_schedule,

@@ -43,7 +43,6 @@ def make_service(
     rename = next((s.rename_map for s in steps if isinstance(s, RenameObservationsProcessorStep)), None)
     inputs = Inputs(engine.config, limits, rename, rig)
     if sizes is None:
-        # Two lengths of prompt and three sizes are six graphs; eight stay recorded (inference/cuda_graphs.py).
         sizes = (1, 2, 4) if str(engine.config.device).startswith("cuda") else (1, 2, 3, 4)
     worker = BatchWorker(engine, sizes, limits.queue, lambda: engine.warm(inputs, sizes))
     return Service(engine, inputs, worker, limits)
