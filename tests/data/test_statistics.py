@@ -2,14 +2,17 @@
 
 import json
 import logging
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
+import pyarrow
 import pytest
 import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.datasets.dataset_tools import recompute_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset, LeRobotDatasetMetadata
+from pyarrow import parquet
 
 from lerobot_policy_pi05_geometry.data.quantiles import action_kind, write_frame_quantiles
 from lerobot_policy_pi05_geometry.data.statistics import check_stats, require_matching_kind
@@ -219,7 +222,31 @@ def test_the_kind_of_the_action_statistics_is_known(dataset):
     recompute_stats(LeRobotDataset(REPO_ID, root=dataset))
     assert action_kind(metadata(dataset)) == "absolute"
     assert action_kind(SimpleNamespace(root=dataset, stats=None)) is None
-    assert action_kind(SimpleNamespace(root=dataset.parent, stats=metadata(dataset).stats)) is None
+    assert action_kind(SimpleNamespace(root=dataset / "nothing", stats=metadata(dataset).stats)) is None
+
+
+def test_the_frames_decide_of_what_kind_statistics_are(dataset):
+    """LeRobot's recompute_stats leaves the statistics of the episodes as they were when an action is corrected."""
+    (file,) = (dataset / "data").rglob("*.parquet")
+    table = parquet.read_table(file)
+    actions = np.stack(table["action"].to_pylist())
+    actions[3] *= 3
+    column = pyarrow.array(actions.tolist(), type=table.schema.field("action").type)
+    number = table.schema.get_field_index("action")
+    parquet.write_table(table.set_column(number, table.schema.field("action"), column), file)
+    recompute_stats(LeRobotDataset(REPO_ID, root=dataset))
+    assert action_kind(metadata(dataset)) == "absolute"
+    write_frame_quantiles(dataset, REPO_ID, ("observation.state", "action"))
+    with pytest.raises(ValueError, match="needs statistics of relative actions"):
+        require_matching_kind(make_config(use_relative_actions=True), metadata(dataset))
+    make_relative(dataset)
+    assert action_kind(metadata(dataset)) == "relative"
+
+
+def test_the_kind_is_known_without_the_frames_too(dataset):
+    """Of a dataset that is streamed, only meta/ is there."""
+    shutil.rmtree(dataset / "data")
+    assert action_kind(metadata(dataset)) == "absolute"
 
 
 def test_a_policy_and_statistics_of_another_kind_are_refused(dataset):

@@ -156,5 +156,7 @@ def test_values_are_checked_on_a_sample_of_pixels_from_every_row_and_column():
 
 def test_the_error_of_a_wrong_unit_says_what_streaming_does():
     """LeRobot ignores --dataset.depth_output_unit there, so the declared unit may be the right one."""
-    with pytest.raises(ValueError, match=r"LeRobot ignores that option with --dataset.streaming=true, and reads 'mm'"):
+    with pytest.raises(
+        ValueError, match=r"with --dataset.streaming=true and with --dataset.eval_split above 0, and reads 'mm'"
+    ):
         check_unit(torch.full((1, 1, 4, 5), 700.0), KEY, "m")

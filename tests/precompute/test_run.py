@@ -19,6 +19,8 @@ from lerobot_policy_pi05_geometry.precompute import Precompute, begin, disk_need
 from tests.datasets import REPO_ID, write_dataset
 from tests.geometry.da3.tiny import write_tiny
 from tests.geometry.feature_store.test_shards import files
+from tests.geometry.test_depth_names import NAME
+from tests.geometry.test_depth_names import write_dataset as write_depth_dataset
 
 BATCH = 2
 FRAMES = 26
@@ -63,6 +65,16 @@ def test_features_are_those_of_the_live_source_in_bfloat16(whole, dataset):
         live = whole.source(images).features
         torch.testing.assert_close(store.read([index]).float(), live, rtol=2**-7, atol=2e-3)
     assert (store.read([0]).float() - store.read([1]).float()).abs().max() > 0.5
+
+
+@pytest.mark.parametrize("key", ["observation.depth_front", "observation.images.depth.front"])
+def test_depth_under_another_name_is_no_rgb_camera(key, tmp_path):
+    data = LeRobotDataset(NAME, root=write_depth_dataset(tmp_path / "data", key), return_uint8=True)
+    encoder = write_tiny(tmp_path / "encoder" / "model.safetensors").parent
+    work = prepare(data, str(encoder), 3, image_size=42, output=tmp_path / "stores")
+    assert work.manifest.cameras == {"front": "observation.images.front"}
+    begin(work)
+    work.run(BATCH)
 
 
 def test_the_work_of_two_ranks_is_the_work_of_one(whole, tmp_path):

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.parallel import DistributedDataParallel
 
+from lerobot_policy_pi05_geometry.geometry.keys import RIG
 from lerobot_policy_pi05_geometry.model.gemma import GemmaLayer
 from lerobot_policy_pi05_geometry.training.micro_batches import rows_of
 from tests.entry_points import CHUNK, WRIST_POSE, make_batch, make_policy
@@ -178,6 +179,13 @@ def test_poses_of_samples_are_cut_and_those_of_the_whole_batch_are_not(size):
         assert torch.equal(rows_of({WRIST_POSE: per_sample}, size, slice(1, 3))[WRIST_POSE], per_sample[1:3])
     for of_all in (poses[0], poses[0].flatten()):
         assert torch.equal(rows_of({WRIST_POSE: of_all}, size, slice(1, 3))[WRIST_POSE], of_all)
+
+
+@pytest.mark.parametrize("size", [3, 4, 16])
+def test_rigs_of_samples_are_cut_also_where_a_batch_is_as_long_as_a_pose(size):
+    rigs = torch.arange(size)
+    assert torch.equal(rows_of({RIG: rigs}, size, slice(1, 3))[RIG], rigs[1:3])
+    assert torch.equal(rows_of({RIG: rigs[:, None]}, size, slice(1, 3))[RIG], rigs[1:3, None])
 
 
 def test_a_negative_size_is_refused():

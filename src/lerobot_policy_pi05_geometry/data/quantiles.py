@@ -88,27 +88,41 @@ def _with_full_range(key: str, stats: Mapping[str, Mapping[str, Any]], dims: Seq
 def action_kind(meta: Any) -> Literal["absolute", "relative"] | None:
     """Whether a dataset's action statistics are of absolute or of relative actions; None if that cannot be told.
 
-    LeRobot's `recompute_stats` with `relative_action` replaces the dataset's statistics and leaves those of its episodes,
-    which are of the recorded, absolute actions. So statistics whose minimum and maximum are the episodes' are absolute.
+    Recorded actions are absolute. So statistics whose minimum and maximum are those of the recorded actions are absolute.
     """
     stats = (getattr(meta, "stats", None) or {}).get(ACTION, {})
-    if not {"min", "max"} <= set(stats):
+    recorded = _range_of_actions(Path(meta.root)) if {"min", "max"} <= set(stats) else None
+    if recorded is None:
         return None
-    folder = Path(meta.root) / "meta" / "episodes"
-    if not folder.is_dir():
-        return None
-    table = tables.dataset(str(folder), format="parquet")
-    columns = [f"stats/{ACTION}/min", f"stats/{ACTION}/max"]
-    if not set(columns) <= set(table.schema.names):
-        return None
-    lows, highs = (np.stack(table.to_table(columns=[name])[name].to_pylist()) for name in columns)  # (episodes, D)
-    low, high = lows.min(axis=0), highs.max(axis=0)
+    low, high = recorded
     given_low, given_high = (np.asarray(stats[name], dtype=np.float64).reshape(-1) for name in ("min", "max"))
     if given_low.shape != low.shape:
         return None
     tolerance = 1e-3 * (high - low) + 1e-6
     same = (np.abs(given_low - low) <= tolerance) & (np.abs(given_high - high) <= tolerance)
     return "absolute" if same.all() else "relative"
+
+
+def _range_of_actions(root: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Smallest and largest recorded action, (D,) each: of all frames, or by the episodes' statistics if the data are streamed.
+
+    The frames decide where they are: LeRobot's `recompute_stats` leaves the statistics of the episodes as they were.
+    """
+    for folder, columns in (
+        (root / "data", (ACTION, ACTION)),
+        (root / "meta" / "episodes", (f"stats/{ACTION}/min", f"stats/{ACTION}/max")),
+    ):
+        table = tables.dataset(str(folder), format="parquet") if folder.is_dir() else None
+        if table is not None and set(columns) <= set(table.schema.names):
+            rows = [
+                [np.stack(batch[name].to_numpy(zero_copy_only=False)) for name in columns]  # (rows, D) each
+                for batch in table.to_batches(columns=list(dict.fromkeys(columns)))
+                if len(batch)
+            ]
+            low = np.min([lows.reshape(len(lows), -1).min(axis=0) for lows, _ in rows], axis=0)
+            high = np.max([highs.reshape(len(highs), -1).max(axis=0) for _, highs in rows], axis=0)
+            return low, high
+    return None
 
 
 def covered(stats: Mapping[str, Any], low_name: str = "q01", high_name: str = "q99") -> np.ndarray:

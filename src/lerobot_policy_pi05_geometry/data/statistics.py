@@ -65,7 +65,8 @@ def require_matching_kind(config: "PI05GeometryConfig", dataset_meta: Any) -> No
     if not config.use_relative_actions and kind == "relative":
         raise ValueError(
             "The dataset's action statistics are of relative actions, but the policy's actions are absolute; set "
-            "--policy.use_relative_actions=true, or recompute them with `pi05-geometry quantiles --actions`."
+            "--policy.use_relative_actions=true, or make them absolute again with `lerobot-edit-dataset --operation.type "
+            "recompute_stats`."
         )
 
 

@@ -140,5 +140,5 @@ def check_unit(
             f"{key} has a median distance of {metres[wrong][0].item():.4g} m when read as '{unit}', outside {low}-{high} "
             "m: the unit is probably wrong; set --policy.depth_unit to the unit of the data ('mm' or 'm'; LeRobot "
             "datasets are read as --dataset.depth_output_unit says, 'mm' by default, but LeRobot ignores that option with "
-            "--dataset.streaming=true, and reads 'mm')."
+            "--dataset.streaming=true and with --dataset.eval_split above 0, and reads 'mm')."
         )

@@ -105,6 +105,7 @@ def prepare(
         input_features=dataset_to_policy_features(dataset.meta.features),
         device="cpu",
     )
+    config.set_dataset_feature_metadata(dataset.meta.features)  # which tells depth from colour
     config.validate_features()
     keys = config.rgb_cameras()
     if not keys:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ..geometry.keys import CALIBRATION_PREFIX
+from ..geometry.keys import CALIBRATION_PREFIX, RIG
 from ..model.layer_calls import draws
 from .sharding import require_whole_parameters
 
@@ -77,7 +77,8 @@ def rows_of(batch: Mapping[str, Any], size: int, rows: slice) -> dict[str, Any]:
 
     def per_sample(key: str, value: Any) -> bool:
         if isinstance(value, Tensor):
-            pose_of_all = key.startswith(CALIBRATION_PREFIX) and value.shape in ((4, 4), (16,))  # once for the batch
+            # Once for the batch, unless it is the rigs of 16 samples.
+            pose_of_all = key.startswith(CALIBRATION_PREFIX) and key != RIG and value.shape in ((4, 4), (16,))
             return value.ndim > 0 and value.shape[0] == size and not pose_of_all
         return isinstance(value, list | tuple) and len(value) == size
 
