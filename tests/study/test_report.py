@@ -80,3 +80,22 @@ def test_a_task_of_libero_brings_the_floor_of_its_placement():
     shares = f"blind plan {placed.blind}/{placed.blind_episodes}, expert {placed.expert}/{placed.episodes}"
     assert shares in floor_sentence(placed)
     assert simulated_task("button-press-topdown-wide").floor() is None  # its study has a blind policy instead
+
+
+def test_arms_are_compared_on_the_tasks_that_both_have():
+    """Geometry also ran on an easy task, in another block: there RGB only would look worse than it is."""
+    rates = {
+        ("hard", "geometry"): 3,
+        ("hard", "rgb"): 3,
+        ("easy", "geometry"): 9,
+        ("easy", "random"): 8,
+        ("other", "blind"): 1,
+    }
+    rows = pd.concat([table(rates, condition) for condition in ("inside", "outside", "depth-off")])
+    found = headline(rows)
+    assert "geometry succeeds in 30% (" in found
+    assert "RGB only in 30% (" in found
+    assert "Both were evaluated on hard." in found
+    assert "With its depth camera off and the camera within the range, geometry succeeds in 30% (" in found
+    assert found.endswith("For comparison: random tokens 80% (on easy, where geometry has 90%).")
+    assert "The best cell of this study" in headline(rows[(rows["arm"] != "rgb") | (rows["condition"] != "outside")])

@@ -16,7 +16,7 @@ from ..inspect.pictures import depth_figure, layout_figure, segment_share_figure
 from ..sim.libero.floors import Floor
 from .arms import ARMS
 from .conditions import find_condition, order_of
-from .results import ArmComparison, Cell, cells, comparisons, episodes_table, pooled_difference
+from .results import ArmComparison, Cell, cells, comparisons, episodes_table, on_common_tasks, pooled_difference
 from .runs import file_name
 from .simulated import SimulatedRun
 from .simulated_tasks import simulated_task
@@ -67,11 +67,11 @@ def floor_sentence(floor: Floor) -> str:
 
 def headline(table: pd.DataFrame) -> str:
     """The result: geometry against RGB only with the camera outside the training range, with intervals."""
-    rows = table[table["condition"] == "outside"]
-    arms = {cell.arm: cell for cell in cells(rows.assign(task="all"))}
-    if "geometry" not in arms or "rgb" not in arms:
+    rows = pd.concat(on_common_tasks(table, *((arm, "outside") for arm in _COMPARED)))
+    if rows.empty:
         best = max(cells(table), key=lambda cell: cell.rate)
         return f"The best cell of this study is {best.arm} under '{best.condition}': {_cell(best)}."
+    arms = {cell.arm: cell for cell in cells(rows.assign(task="all"))}
     geometry, rgb = arms["geometry"], arms["rgb"]
     apart = geometry.interval()[0] > rgb.interval()[1] or rgb.interval()[0] > geometry.interval()[1]
     verdict = "the intervals do not overlap" if apart else "the intervals overlap, so the difference is not established"
@@ -79,46 +79,41 @@ def headline(table: pd.DataFrame) -> str:
         "With the camera outside the range it was trained on, the policy with geometry succeeds in "
         f"{_cell(geometry)} of episodes and RGB only in {_cell(rgb)}: {verdict}."
     )
-    of_both = [task for task, of_task in rows.groupby("task") if set(_COMPARED) <= set(of_task["arm"])]
-    if of_both and rows["training_seed"].nunique() > 1:
-        difference, low, high = (
-            100 * points for points in pooled_difference(rows[rows["task"].isin(of_both)], *_COMPARED)
-        )
+    tasks, evaluated = list(rows["task"].unique()), table.loc[table["condition"] == "outside", ["arm", "task"]]
+    if set(tasks) < set(evaluated.loc[evaluated["arm"].isin(_COMPARED), "task"]):
+        text += f" Both were evaluated on {', '.join(tasks)}."
+    if rows["training_seed"].nunique() > 1:
+        difference, low, high = (100 * points for points in pooled_difference(rows, *_COMPARED))
         text += (
             f" The difference is {difference:+.0f} points ({low:+.0f} to {high:+.0f}, 95 % bootstrap over training seeds and "
             "episodes)."
         )
     text += _without_depth(table)
-    controls = [_control(name, rows, arm) for arm, name in _NAMES.items() if arm in arms]
-    return text + (f" For comparison: {', '.join(controls)}." if controls else "")
+    controls = ", ".join(filter(None, (_control(name, table, arm, tasks) for arm, name in _NAMES.items())))
+    return text + (f" For comparison: {controls}." if controls else "")
 
 
 def _without_depth(table: pd.DataFrame) -> str:
     """Geometry with its depth camera off, beside RGB only with the same cameras; empty if it was not evaluated."""
-    found = {
-        arm: [cell for cell in cells(table[table["condition"] == condition].assign(task="all")) if cell.arm == arm]
-        for arm, condition in (("geometry", "depth-off"), ("rgb", "inside"))
-    }
-    if not all(found.values()):
+    rows = on_common_tasks(table, ("geometry", "depth-off"), ("rgb", "inside"))
+    if rows[0].empty:
         return ""
+    geometry, rgb = (cells(of_arm.assign(task="all"))[0] for of_arm in rows)
     return (
-        f" With its depth camera off and the camera within the range, geometry succeeds in {_cell(found['geometry'][0])}, "
-        f"RGB only in {_cell(found['rgb'][0])}."
+        f" With its depth camera off and the camera within the range, geometry succeeds in {_cell(geometry)}, "
+        f"RGB only in {_cell(rgb)}."
     )
 
 
-def _control(name: str, rows: pd.DataFrame, arm: str) -> str:
-    """The rate of an arm; if it ran on some tasks only, with geometry's rate on the same tasks."""
-    tasks = rows.loc[rows["arm"] == arm, "task"].unique()
-    of_tasks = rows[rows["task"].isin(tasks)]
-    text = f"{name} {_rate(of_tasks, arm):.0%}"
-    if len(tasks) < rows["task"].nunique():
-        text += f" (on {', '.join(tasks)}, where geometry has {_rate(of_tasks, 'geometry'):.0%})"
+def _control(name: str, table: pd.DataFrame, arm: str, tasks: Sequence[str]) -> str:
+    """The rate of an arm outside; if on other tasks than these, with geometry's rate on the same. Empty if not evaluated."""
+    of_arm, of_geometry = on_common_tasks(table, (arm, "outside"), ("geometry", "outside"))
+    if of_arm.empty:
+        return ""
+    text, own = f"{name} {of_arm['success'].mean():.0%}", list(of_arm["task"].unique())
+    if set(own) != set(tasks):
+        text += f" (on {', '.join(own)}, where geometry has {of_geometry['success'].mean():.0%})"
     return text
-
-
-def _rate(rows: pd.DataFrame, arm: str) -> float:
-    return float(rows.loc[rows["arm"] == arm, "success"].mean())
 
 
 _COMPARED = ("geometry", "rgb")

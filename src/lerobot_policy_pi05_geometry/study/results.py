@@ -108,11 +108,24 @@ def comparisons(table: pd.DataFrame, reference: str = "geometry") -> list[ArmCom
 
 
 def pooled_difference(rows: pd.DataFrame, arm: str, over: str) -> tuple[float, float, float]:
-    """Success of one arm minus another's, averaged over the tasks in `rows` (of one condition): mean, low, high."""
+    """Success of one arm minus another's, averaged over the tasks in `rows`: mean, low, high.
+
+    rows: of one condition, on tasks that both arms have (`on_common_tasks`).
+    """
     pairs = [
         [success_matrix(of_task[of_task["arm"] == name]) for name in (arm, over)] for _, of_task in rows.groupby("task")
     ]
     return bootstrap(*(first.astype(float) - second.astype(float) for first, second in pairs))
+
+
+def on_common_tasks(table: pd.DataFrame, *sides: tuple[str, str]) -> list[pd.DataFrame]:
+    """The rows of each (arm, condition) on the tasks that all of them have; without rows if there is no such task.
+
+    Arms of different [[compare]] blocks have different tasks, and pooled over these the easier tasks would win.
+    """
+    rows = [table[(table["arm"] == arm) & (table["condition"] == condition)] for arm, condition in sides]
+    common = set.intersection(*(set(of_side["task"]) for of_side in rows))
+    return [of_side[of_side["task"].isin(common)] for of_side in rows]
 
 
 def success_matrix(rows: pd.DataFrame) -> np.ndarray:
