@@ -8,12 +8,12 @@ from lerobot_policy_pi05_geometry.study.claims import claims, speed_factor
 EPISODES = 50
 
 
-def episodes(cells: dict[tuple[str, str, int], float]) -> pd.DataFrame:
-    """cells: (arm, condition, multiple) -> success rate, in each of two training seeds and two tasks."""
+def episodes(cells: dict[tuple[str, str, int], float], tasks: str = "ab") -> pd.DataFrame:
+    """cells: (arm, condition, multiple) -> success rate, in each of two training seeds and of the tasks."""
     rows = [
         (task, arm, multiple, seed, condition, episode, episode < round(rate * EPISODES))
         for (arm, condition, multiple), rate in cells.items()
-        for task in ("a", "b")
+        for task in tasks
         for seed in (0, 1)
         for episode in range(EPISODES)
     ]
@@ -71,3 +71,17 @@ def test_a_rival_that_reaches_geometry_gives_a_factor():
 def test_what_was_not_run_is_not_claimed(missing):
     table = episodes({(arm, "outside", 1): 0.5 for arm in {"geometry", "rgb"} - {missing}})
     assert {claim.verdict for claim in claims(table, table, 1500)} == {"not tested"}
+
+
+def test_a_claim_is_of_the_tasks_that_both_arms_have():
+    """Geometry also ran on an easy task, and blocks of other arms on others."""
+    arms, conditions = ("geometry", "rgb", "rgb-wide"), ("inside", "outside", "depth-off")
+    common = episodes({(arm, condition, 1): 0.3 for arm in arms for condition in conditions}, "a")
+    alone = episodes({("geometry", condition, 1): 0.9 for condition in conditions}, "b")
+    table = pd.concat([common, alone, episodes({("rgb+rays", "outside", 1): 0.9}, "c")])
+    found = claims(table, table, 1500)
+    assert [claim.verdict for claim in found] == ["no", "yes", "yes", "no", "not tested", "not tested"]
+    assert "90%" not in " ".join(claim.sentence for claim in found)
+    assert speed_factor(table, "rgb-wide") == (1, 1)
+    apart = pd.concat([alone, common[common["arm"] != "geometry"]])
+    assert {claim.verdict for claim in claims(apart, apart, 1500)} == {"not tested"}

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from .results import pooled_difference, success_matrix
+from .results import on_common_tasks, pooled_difference, success_matrix
 from .statistics import bootstrap
 
 RATIO, INSIDE_MARGIN, DEPTH_OFF_SHARE = 2.0, -0.10, 0.8
@@ -43,10 +43,11 @@ def claims(final: pd.DataFrame, every: pd.DataFrame, steps: int) -> list[Claim]:
 
 def _outside(final: pd.DataFrame) -> Iterator[Claim]:
     name = "outside the training range, at least twice RGB only's success, intervals apart"
-    geometry, rgb = _pooled(final, "geometry", "outside"), _pooled(final, "rgb", "outside")
-    if geometry is None or rgb is None:
-        yield Claim(name, "not tested", "The study has no episodes of geometry and of RGB only outside the range.")
+    rows = on_common_tasks(final, ("geometry", "outside"), ("rgb", "outside"))
+    if rows[0].empty:
+        yield Claim(name, "not tested", "The study has no task with geometry and RGB only outside the range.")
         return
+    geometry, rgb = map(_pooled, rows)
     apart = geometry[1] > rgb[2]
     holds = apart and geometry[0] >= RATIO * rgb[0]
     sentence = (
@@ -58,9 +59,9 @@ def _outside(final: pd.DataFrame) -> Iterator[Claim]:
 
 def _inside(final: pd.DataFrame) -> Iterator[Claim]:
     name = f"inside the training range, lower bound of the difference above {100 * INSIDE_MARGIN:.0f} points"
-    rows = final[final["condition"] == "inside"]
-    if not {"geometry", "rgb"} <= set(rows["arm"]):
-        yield Claim(name, "not tested", "The study has no episodes of geometry and of RGB only inside the range.")
+    rows = pd.concat(on_common_tasks(final, ("geometry", "inside"), ("rgb", "inside")))
+    if rows.empty:
+        yield Claim(name, "not tested", "The study has no task with geometry and RGB only inside the range.")
         return
     difference, low, high = pooled_difference(rows, "geometry", "rgb")
     sentence = f"Inside, geometry minus RGB only is {_points(difference, low, high)}."
@@ -69,10 +70,11 @@ def _inside(final: pd.DataFrame) -> Iterator[Claim]:
 
 def _depth_off(final: pd.DataFrame) -> Iterator[Claim]:
     name = f"with the depth camera off, at least {DEPTH_OFF_SHARE} of RGB only's success"
-    geometry, rgb = _pooled(final, "geometry", "depth-off"), _pooled(final, "rgb", "inside")
-    if geometry is None or rgb is None:
-        yield Claim(name, "not tested", "The study has no episodes with the depth camera off.")
+    rows = on_common_tasks(final, ("geometry", "depth-off"), ("rgb", "inside"))
+    if rows[0].empty:
+        yield Claim(name, "not tested", "The study has no task with geometry's depth camera off and RGB only.")
         return
+    geometry, rgb = map(_pooled, rows)
     holds = geometry[0] >= DEPTH_OFF_SHARE * rgb[0]
     sentence = f"With the depth camera off, geometry succeeds in {_text(geometry)}, RGB only in {_text(rgb)}."
     yield Claim(name, "yes" if holds else "no", sentence)
@@ -80,16 +82,16 @@ def _depth_off(final: pd.DataFrame) -> Iterator[Claim]:
 
 def _rival(final: pd.DataFrame, every: pd.DataFrame, rival: str, steps: int) -> Iterator[Claim]:
     name = f"{rival} does not reach geometry outside the training range"
-    rows = final[final["condition"] == "outside"]
-    if not {"geometry", rival} <= set(rows["arm"]):
-        yield Claim(name, "not tested", f"The study has no episodes of geometry and of {rival} outside the range.")
+    rows = pd.concat(on_common_tasks(final, ("geometry", "outside"), (rival, "outside")))
+    if rows.empty:
+        yield Claim(name, "not tested", f"The study has no task with geometry and {rival} outside the range.")
         return
     difference, low, high = pooled_difference(rows, "geometry", rival)
     sentence = f"Outside, geometry minus {rival} is {_points(difference, low, high)}."
     if low > 0:
         yield Claim(name, "yes", sentence)
         return
-    factor = speed_factor(every[every["condition"] == "outside"], rival)
+    factor = speed_factor(every, rival)
     if factor is None:
         sentence += " Geometry does not reach its success with fewer steps either."
     else:
@@ -98,9 +100,13 @@ def _rival(final: pd.DataFrame, every: pd.DataFrame, rival: str, steps: int) -> 
     yield Claim(name, "no", sentence)
 
 
-def speed_factor(outside: pd.DataFrame, rival: str) -> tuple[int, int] | None:
-    """The rival's largest multiple, and the smallest with which geometry has at least its success; None if none has."""
-    rates = {arm: _rates(outside[outside["arm"] == arm]) for arm in ("geometry", rival)}
+def speed_factor(every: pd.DataFrame, rival: str) -> tuple[int, int] | None:
+    """The rival's largest multiple, and the smallest with which geometry has at least its success; None if none has.
+
+    Success outside the training range, on the tasks that both have.
+    """
+    rows = on_common_tasks(every, ("geometry", "outside"), (rival, "outside"))
+    rates = dict(zip(("geometry", rival), map(_rates, rows), strict=True))
     last = max(rates[rival])
     reached = [multiple for multiple, rate in rates["geometry"].items() if rate >= rates[rival][last]]
     return (last, min(reached)) if reached else None
@@ -112,11 +118,8 @@ def _rates(rows: pd.DataFrame) -> dict[int, float]:
     return {int(multiple): float(rate) for multiple, rate in by_task.groupby("multiple").mean().items()}
 
 
-def _pooled(final: pd.DataFrame, arm: str, condition: str) -> tuple[float, float, float] | None:
-    """Success of an arm, mean over tasks, with its bootstrap interval; None if it was not evaluated."""
-    rows = final[(final["arm"] == arm) & (final["condition"] == condition)]
-    if rows.empty:
-        return None
+def _pooled(rows: pd.DataFrame) -> tuple[float, float, float]:
+    """Success of one arm under one condition, mean over tasks, with its bootstrap interval."""
     return bootstrap(*(success_matrix(of_task).astype(np.float64) for _, of_task in rows.groupby("task")))
 
 
