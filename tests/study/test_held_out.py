@@ -1,5 +1,6 @@
 """A study on a user's own dataset: what is held out, what is compared, and what comes out."""
 
+import os
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -24,6 +25,7 @@ from lerobot_policy_pi05_geometry.study.held_out import (
 from lerobot_policy_pi05_geometry.study.warm_start import geometry_start
 from tests import commands
 from tests.checkpoint.conversion.sources import write_lerobot
+from tests.datasets import write_dataset
 
 pytestmark = pytest.mark.sim
 OPTIONS = {"policy.device": "cpu", "policy.n_action_steps": "4", "batch_size": "4"}
@@ -158,3 +160,30 @@ def test_a_pi05_that_was_trained_on_is_another_one(root, tmp_path):
         (run,) = held_out_runs(tmp_path, root, "local/mine", ["geometry"], [0], {}, 2, 0.4, 3, str(pi05))
         folders.append(run.folder)
     assert folders[0] != folders[1]
+
+
+def test_a_run_is_another_one_when_its_data_or_its_calibration_change(tmp_path):
+    """By content: a file that was only written again is the same."""
+    root, calibration = write_dataset(tmp_path / "data"), tmp_path / "calibration.json"
+    calibration.write_text("one")
+    options = {"policy.calibration_path": str(calibration)}
+
+    def folder():
+        return held_out_runs(tmp_path / "out", root, "local/mine", ["rgb"], [0], options, 2, 0.4, 3)[0].folder
+
+    before = folder()
+    os.utime(next((root / "data").rglob("*.parquet")))
+    assert folder() == before
+    seen = {before}
+    tasks = root / "meta" / "tasks.parquet"
+    for change in (
+        lambda: calibration.write_text("two"),
+        lambda: (root / "meta" / "calibration.json").write_text("two"),
+        lambda: pd.read_parquet(tasks).rename(index={"push": "pull"}).to_parquet(tasks),
+    ):
+        change()
+        assert folder() not in seen
+        seen.add(folder())
+    data = next((root / "data").rglob("*.parquet"))
+    data.write_bytes(data.read_bytes()[::-1])
+    assert folder() not in seen

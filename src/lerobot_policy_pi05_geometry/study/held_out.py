@@ -25,6 +25,7 @@ from ..checkpoint.load import LoadedPolicy, load_policy
 from ..dataset_folder import require_dataset
 from ..geometry.keys import DEPTH_SUFFIX, depth_features, find_depth_key, is_depth_key
 from .arms import DEPTH, blind_inputs, find_arm
+from .own_data import dataset_identity
 from .runs import ReportProgress, Run, option_list, versions
 from .training import train_with
 from .warm_start import make_start, remaining_options
@@ -64,12 +65,11 @@ class HeldOutRun(Run):
         return self.frames * math.ceil(self.held_out * episodes)
 
     def description(self) -> dict[str, Any]:
-        meta = self.dataset_root / "meta"
         return {
             "arm": self.arm_name,
             "arguments": self.arguments(Path("output"), Path("start")),
             "pi05": None if self.pi05 is None else _description_of(self.pi05),
-            "dataset": [(meta / name).read_text() for name in ("info.json", "stats.json")],
+            "dataset": dataset_identity(self.dataset_root, dict(self.options)),
             "versions": versions("lerobot_policy_pi05_geometry", "lerobot", "torch"),
         }
 
