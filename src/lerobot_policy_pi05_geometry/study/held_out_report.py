@@ -1,6 +1,7 @@
 """The report of a study on a user's dataset: action error on held-out episodes, per arm, camera and step ahead."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,16 @@ from .held_out import ALL_CAMERAS, NO_DEPTH, ONLY, HeldOutRun
 from .statistics import bootstrap
 from .training_log import read_curve
 
-Errors = dict[tuple[str, str], np.ndarray]  # by arm and condition, (training seeds, episodes, S)
+
+@dataclass(frozen=True)
+class ArmErrors:
+    """Errors of an arm under a condition, (training seeds, episodes, S). seeds: in this order; a crashed run has no error."""
+
+    seeds: tuple[int, ...]
+    values: np.ndarray
+
+
+Errors = dict[tuple[str, str], ArmErrors]  # by arm and condition
 
 
 def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str) -> Path:
@@ -36,8 +46,7 @@ def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str
     page.text(
         f"{len(runs)} training runs of {first.steps} steps, {seeds} training seed{'s' if seeds > 1 else ''}; the last "
         f"{first.held_out:.0%} of the episodes were held out. Errors are mean absolute errors of predicted action chunks, in "
-        "standard deviations of the recorded actions, with 95 % intervals from a "
-        "bootstrap over training seeds and held-out episodes."
+        f"standard deviations of the recorded actions{_about_intervals(errors)}"
     )
     crashed = [run.name for run in runs if run.crash.exists()]
     if crashed:
@@ -50,14 +59,17 @@ def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str
     arms = [arm for arm in ARMS if (arm, ALL_CAMERAS) in errors]
     page.table(
         ["arm", "what it is", *(_title(c) for c in conditions)],
-        [[arm, ARMS[arm].title, *(_interval(errors[arm, c].mean(axis=2)) for c in conditions)] for arm in arms],
+        [[arm, ARMS[arm].title, *(_interval(errors[arm, c].values.mean(axis=2)) for c in conditions)] for arm in arms],
     )
     if "geometry" in arms and len(arms) > 1:
-        page.text("Error of geometry minus error of each arm on the same episodes. Negative: geometry predicts better.")
+        page.text(
+            "Error of geometry minus error of each arm on the same episodes and training seeds. Negative: geometry predicts "
+            "better."
+        )
         rows = [[arm, *(_gap(errors, arm, c) for c in conditions)] for arm in arms if arm != "geometry"]
         page.table(["geometry minus", *(_title(c) for c in conditions)], rows)
-    bands = {arm: _bands(errors[arm, ALL_CAMERAS]) for arm in arms}
-    caption = "Error by number of steps ahead: mean and interval."
+    bands = {arm: _bands(errors[arm, ALL_CAMERAS].values) for arm in arms}
+    caption = "Error by number of steps ahead: mean, and interval if there is one."
     page.row(picture(horizon_figure(bands), caption, pictures / "horizon.png"))
     curves = {
         run.arm_name: read_curve(run.log, run.log_every)
@@ -73,8 +85,8 @@ def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str
 
 
 def collect(runs: Sequence[HeldOutRun]) -> Errors:
-    """Errors per arm and condition, (training seeds, episodes, S). Raises ValueError if a run is neither complete nor crashed."""
-    found: dict[tuple[str, str], list[np.ndarray]] = {}
+    """Errors per arm and condition. Raises ValueError if a run is neither complete nor crashed."""
+    found: dict[tuple[str, str], dict[int, np.ndarray]] = {}
     for run in runs:
         if run.crash.exists():
             continue
@@ -85,10 +97,13 @@ def collect(runs: Sequence[HeldOutRun]) -> Errors:
                 raise ValueError(
                     f"Run {run.name} has not been evaluated under '{condition}'; start the study again to complete it."
                 )
-            found.setdefault((run.arm_name, condition), []).append(np.nanmean(errors / scale, axis=2))
+            found.setdefault((run.arm_name, condition), {})[run.seed] = np.nanmean(errors / scale, axis=2)
     if not found:
         raise ValueError("Every run of the study crashed; the reason is in each run.log.")
-    return {key: _complete_steps(np.stack(values)) for key, values in found.items()}
+    return {
+        key: ArmErrors(tuple(by_seed), _complete_steps(np.stack(list(by_seed.values()))))
+        for key, by_seed in found.items()
+    }
 
 
 def errors_table(runs: Sequence[HeldOutRun]) -> pd.DataFrame:
@@ -107,20 +122,41 @@ def errors_table(runs: Sequence[HeldOutRun]) -> pd.DataFrame:
 def headline(errors: Errors) -> str:
     """The result in one sentence."""
     if ("geometry", ALL_CAMERAS) not in errors or ("rgb", ALL_CAMERAS) not in errors:
-        arm, _ = min(errors, key=lambda key: errors[key].mean())
+        arm, _ = min(errors, key=lambda key: errors[key].values.mean())
         return f"The arm with the smallest error on held-out episodes is {arm}."
-    geometry, rgb = errors["geometry", ALL_CAMERAS], errors["rgb", ALL_CAMERAS]
+    geometry, rgb = _paired(errors, "geometry", "rgb", ALL_CAMERAS)
+    if not len(geometry):
+        return "Runs crashed, and geometry and RGB only have no training seed in common, so they are not compared."
     means = f"{geometry.mean():.3f} with geometry, {rgb.mean():.3f} with RGB only"
-    if geometry.shape != rgb.shape:
-        return (
-            f"On held-out episodes the action error is {means}; runs crashed, so a paired comparison is not possible."
-        )
-    gap, low, high = bootstrap((geometry - rgb).mean(axis=2))
+    if geometry.shape[1] < 2:
+        return f"On the one held-out episode the action error is {means}; one episode does not show which is better on others."
+    gap, low, high = bootstrap(geometry - rgb)
     if low <= 0 <= high:
         verdict = "no significant difference"
     else:
         verdict = "geometry predicts better" if gap < 0 else "geometry predicts worse"
-    return f"On held-out episodes the action error is {means}: {verdict} ({gap:+.3f}, {low:+.3f} to {high:+.3f})."
+    text = f"On held-out episodes the action error is {means}: {verdict} ({gap:+.3f}, {low:+.3f} to {high:+.3f})."
+    return text + (_ONE_SEED if len(geometry) == 1 else "")
+
+
+def _about_intervals(errors: Errors) -> str:
+    """The end of a sentence."""
+    some = next(iter(errors.values())).values
+    if some.shape[1] < 2:
+        return "; of one held-out episode there is no interval."
+    text = ", with 95 % intervals from a bootstrap over training seeds and held-out episodes."
+    return text + (_ONE_SEED if len({seed for of_arm in errors.values() for seed in of_arm.seeds}) == 1 else "")
+
+
+_ONE_SEED = " This is of one training seed, so the interval leaves out how much training seeds differ."
+
+
+def _paired(errors: Errors, arm: str, other: str, condition: str) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of two arms on the training seeds that both have, (seeds, episodes) each; no seeds if there is none."""
+    first, second = errors[arm, condition], errors[other, condition]
+    common = [seed for seed in first.seeds if seed in second.seeds]
+    of_first, of_second = (each.values[[each.seeds.index(seed) for seed in common]] for each in (first, second))
+    return of_first.mean(axis=2), of_second.mean(axis=2)
 
 
 def _action_spread(run: HeldOutRun) -> np.ndarray:
@@ -139,15 +175,20 @@ def _bands(errors: np.ndarray) -> np.ndarray:
 
 
 def _interval(values: np.ndarray) -> str:
+    """Mean of (training seeds, episodes), with its interval if there are several episodes."""
     mean, low, high = bootstrap(values)
+    if values.shape[1] < 2:
+        return f"{mean:.3f}"
     return f"{mean:.3f} ({low:.3f} to {high:.3f})"
 
 
 def _gap(errors: Errors, arm: str, condition: str) -> str:
-    geometry, other = errors["geometry", condition], errors[arm, condition]
-    if geometry.shape != other.shape:
-        return "not paired"
-    mean, low, high = bootstrap((geometry - other).mean(axis=2))
+    geometry, other = _paired(errors, "geometry", arm, condition)
+    if not len(geometry):
+        return "no training seed in common"
+    mean, low, high = bootstrap(geometry - other)
+    if geometry.shape[1] < 2:
+        return f"{mean:+.3f}"
     return f"{mean:+.3f} ({low:+.3f} to {high:+.3f})"
 
 

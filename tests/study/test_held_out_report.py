@@ -1,0 +1,60 @@
+"""What the report of a study on own data concludes from errors that are made up."""
+
+import numpy as np
+import pytest
+
+from lerobot_policy_pi05_geometry.study.held_out import held_out_runs
+from lerobot_policy_pi05_geometry.study.held_out_report import collect, headline, write_held_out_report
+from tests.datasets import ACTION_DIM, write_dataset
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return write_dataset(tmp_path_factory.mktemp("data") / "mine")
+
+
+def executed(root, output, errors, episodes, crashed=()):
+    """Runs of two arms without depth; errors: (arm, seed) -> error of each of so many held-out episodes."""
+    arms, seeds = (list(dict.fromkeys(names)) for names in zip(*errors, strict=True))
+    runs = held_out_runs(output, root, "local/mine", arms, seeds, {}, 2, 0.4, 3)
+    for run in runs:
+        run.folder.mkdir(parents=True)
+        if (run.arm_name, run.seed) in crashed:
+            run.crash.write_text("{}")
+            continue
+        run.log.touch()
+        values = np.full((episodes, 4, ACTION_DIM), errors[run.arm_name, run.seed])
+        np.savez_compressed(run.outcome("all-cameras"), errors=values + 0.01 * np.arange(episodes)[:, None, None])
+    return runs
+
+
+def as_geometry(errors):
+    """The errors, those of the arm `random` as geometry's: this dataset has no depth."""
+    return {("geometry" if arm == "random" else arm, condition): of_arm for (arm, condition), of_arm in errors.items()}
+
+
+def test_arms_are_compared_on_the_training_seeds_that_did_not_crash(root, tmp_path):
+    """The error depends on the seed alone, so no arm predicts better, whichever seed each has lost."""
+    errors = {(arm, seed): 0.2 + 0.3 * seed for arm in ("rgb", "random") for seed in range(4)}
+    runs = executed(root, tmp_path, errors, 3, crashed=[("rgb", 0), ("random", 3)])
+    found = as_geometry(collect(runs))
+    assert found["geometry", "all-cameras"].seeds == (0, 1, 2)
+    assert "no significant difference (+0.000, +0.000 to +0.000)." in headline(found)
+    runs = executed(root, tmp_path / "none", errors, 3, crashed=[("rgb", 0), ("rgb", 1), ("random", 2), ("random", 3)])
+    assert "no training seed in common" in headline(as_geometry(collect(runs)))
+
+
+def test_one_held_out_episode_or_one_seed_is_named(root, tmp_path):
+    errors = {("rgb", 0): 0.5, ("random", 0): 0.499}
+    runs = executed(root, tmp_path / "one", errors, 1)
+    found = headline(as_geometry(collect(runs)))
+    assert "On the one held-out episode" in found
+    assert "predicts" not in found
+    page = write_held_out_report(tmp_path / "one", runs, "pi05-geometry study").read_text()
+    assert "of one held-out episode there is no interval" in page
+    assert " to " not in page[page.index("<td>rgb") : page.index("</table>")]
+    runs = executed(root, tmp_path / "two", errors, 2)
+    assert "geometry predicts better" in headline(as_geometry(collect(runs)))
+    assert headline(as_geometry(collect(runs))).endswith("leaves out how much training seeds differ.")
+    more = executed(root, tmp_path / "seeds", {(arm, seed): 0.5 for arm in ("rgb", "random") for seed in (0, 1)}, 2)
+    assert "training seeds differ" not in headline(as_geometry(collect(more)))
