@@ -78,8 +78,8 @@ def test_hidden_depth_measures_nothing_and_the_rest_stays():
 
 
 def test_what_cannot_be_studied_is_named(root, tmp_path):
-    def runs(folder=root, arms=("geometry",), held_out=0.2):
-        return held_out_runs(tmp_path, folder, "local/mine", arms, [0], {}, 4, held_out, 3)
+    def runs(folder=root, arms=("geometry",), held_out=0.2, seeds=(0,), steps=4, frames=3):
+        return held_out_runs(tmp_path, folder, "local/mine", arms, seeds, {}, steps, held_out, frames)
 
     assert view_conditions(root, "local/mine") == [ALL_CAMERAS, NO_DEPTH]
     assert runs()[0].distinct_conditions() == [ALL_CAMERAS, NO_DEPTH]
@@ -90,6 +90,13 @@ def test_what_cannot_be_studied_is_named(root, tmp_path):
         runs(arms=("rgb-wide",))
     with pytest.raises(ValueError, match="between 0 and 1"):
         runs(held_out=1.0)
+    with pytest.raises(ValueError, match="--seeds must name at least one of them, and each once, got 0, 0"):
+        runs(seeds=(0, 0))
+    with pytest.raises(ValueError, match="--arms must name at least one of them, and each once, got rgb, rgb"):
+        runs(arms=("rgb", "rgb"))
+    for name in ("frames", "steps"):
+        with pytest.raises(ValueError, match=f"--{name} must be at least 1, got 0"):
+            runs(**{name: 0})
 
 
 def test_only_arms_that_measure_depth_get_its_augmentation(root, tmp_path):

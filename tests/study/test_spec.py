@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import pytest
 
@@ -105,6 +106,38 @@ def test_what_several_blocks_ask_of_an_arm_adds_up(tmp_path):
 )
 def test_what_means_nothing_is_named(tmp_path, change, message):
     with pytest.raises(ValueError, match=message):
+        read_spec(write(tmp_path, SPEC.replace(*change)))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("[3, 4]", "[0, 0]"), "seeds names 0 more than once"),
+        (("[3, 4]", '["a"]'), "seeds must be a list of whole numbers of at least 0, got ['a']"),
+        (("[3, 4]", "[true]"), "got [True]"),
+        (("[3, 4]", "[-1]"), "got [-1]"),
+        (("[3, 4]", "3"), "seeds must be a list of whole numbers of at least 0, got 3"),
+        (("steps = 7", "evaluation_episodes = 0"), "evaluation_episodes must be a whole number of at least 1, got 0"),
+        (("steps = 7", 'steps = "1500"'), "steps must be a whole number of at least 1, got '1500'"),
+        (("steps = 7", "steps = 0"), "steps must be"),
+        (("steps = 7", "steps = 7.5"), "steps must be"),
+        (("steps = 7", "parallel = 0"), "parallel must be"),
+        (("steps = 7", "videos = -1"), "videos must be a whole number of at least 0"),
+        (("steps = 7", "learning_rate = 0"), "learning_rate must be above 0"),
+        (("steps = 7", "learning_rate = nan"), "learning_rate must be a number, got nan"),
+        (("steps = 7", 'variant = "huge"'), "variant must be one of small, tiny, got 'huge'"),
+        (("steps = 7", "action_steps = 20"), "action_steps (20) cannot exceed chunk_size (8)"),
+        (("[budget]\nsteps = 7", "budget = 3"), "[budget] of"),
+        (("[[compare]]", "[compare]"), "each begun with [[compare]]"),
+        ((SPEC[SPEC.index("[budget]") :], "compare = 3"), "each begun with [[compare]], got 3"),
+        ((SPEC[SPEC.index("[budget]") :], "compare = [3]"), "[[compare]] of"),
+        (('["rgb", "geometry"]', '"rgb"'), "arms must be a list of texts, got 'rgb'"),
+        (('["rgb", "geometry"]', '["rgb", "rgb"]'), "arms names rgb more than once"),
+    ],
+)
+def test_a_value_that_cannot_be_is_named_before_anything_is_trained(tmp_path, change, message):
+    assert change[0] in SPEC
+    with pytest.raises(ValueError, match=re.escape(message)):
         read_spec(write(tmp_path, SPEC.replace(*change)))
 
 

@@ -202,6 +202,14 @@ def held_out_runs(
     Raises FileNotFoundError if there is no dataset, and ValueError if arms or settings do not fit it.
     """
     require_dataset(dataset_root)
+    for name, values in (("arms", arms), ("seeds", seeds)):
+        if not values or len(set(values)) < len(values):
+            raise ValueError(
+                f"--{name} must name at least one of them, and each once, got {', '.join(map(str, values))}."
+            )
+    for name, count, least in (("seeds", min(seeds), 0), ("steps", steps, 1), ("frames", frames, 1)):
+        if count < least:
+            raise ValueError(f"--{name} must be at least {least}, got {count}.")
     if not 0 < held_out < 1:
         raise ValueError(f"The share of held-out episodes must be between 0 and 1, got {held_out}.")
     for name in arms:

@@ -26,9 +26,11 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from ..model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 from .arms import find_arm
 from .conditions import find_condition
 from .simulated_tasks import simulated_task
+from .value_checks import check_values
 
 STUDIES = Path(__file__).parent / "studies"
 
@@ -52,6 +54,20 @@ class Budget:
     adaptation_steps: int = 200  # of an arm that is adapted with one demonstration
     device: str = "cpu"
 
+    def __post_init__(self) -> None:
+        counts = [field.name for field in fields(self) if field.type is int]
+        check_values(self, "[budget]", {**dict.fromkeys(counts, 1), "videos": 0})
+        variants = [name for name in PALIGEMMA_VARIANTS if name in EXPERT_VARIANTS]
+        if self.variant not in variants:
+            raise ValueError(f"[budget] variant must be one of {', '.join(variants)}, got '{self.variant}'.")
+        if self.learning_rate <= 0:
+            raise ValueError(f"[budget] learning_rate must be above 0, got {self.learning_rate}.")
+        if self.action_steps > self.chunk_size:
+            raise ValueError(
+                f"[budget] action_steps ({self.action_steps}) cannot exceed chunk_size ({self.chunk_size}): no more steps are "
+                "predicted."
+            )
+
 
 @dataclass(frozen=True)
 class Pretraining:
@@ -70,6 +86,9 @@ class Pretraining:
     evaluated: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        check_values(self, "[pretrain]", {"episodes": 1, "steps": 1, "seed": 0})
+        if self.learning_rate <= 0:
+            raise ValueError(f"[pretrain] learning_rate must be above 0, got {self.learning_rate}.")
         if not self.tasks:
             raise ValueError("[pretrain] needs at least one task.")
         unknown = sorted(set(self.evaluated) - set(self.tasks))
@@ -93,6 +112,7 @@ class Growth:
     conditions: tuple[str, ...] = ("inside", "outside")
 
     def __post_init__(self) -> None:
+        check_values(self, "[growth]", {})
         if not self.multiples or list(self.multiples) != sorted(set(self.multiples)) or self.multiples[0] < 1:
             raise ValueError(f"[growth] multiples must be whole numbers that rise from 1 on, got {self.multiples}.")
         for name in self.conditions:
@@ -106,6 +126,13 @@ class Sweep:
     azimuths: tuple[float, ...]
     arms: tuple[str, ...]
 
+    def __post_init__(self) -> None:
+        check_values(self, "[sweep]", {})
+        if not self.azimuths or not self.arms:
+            raise ValueError("[sweep] needs at least one azimuth and one arm.")
+        if any(abs(degrees) > 180 for degrees in self.azimuths):
+            raise ValueError(f"[sweep] azimuths must be within -180 and 180 degrees, got {list(self.azimuths)}.")
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -114,6 +141,9 @@ class Comparison:
     tasks: tuple[str, ...]
     arms: tuple[str, ...]
     conditions: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        check_values(self, "[[compare]]", {})
 
 
 @dataclass(frozen=True)
@@ -128,6 +158,7 @@ class StudySpec:
     sweep: Sweep | None = None
 
     def __post_init__(self) -> None:
+        check_values(self, "The study's", {"seeds": 0})
         if not self.seeds or not self.comparisons:
             raise ValueError("A study needs at least one training seed and one [[compare]] block.")
         for comparison in self.comparisons:
@@ -183,15 +214,18 @@ def read_spec(path: str | Path) -> StudySpec:
         raise ValueError(f"{file} is not valid TOML: {error}.") from error
     _check_keys(content, {"seeds", "budget", "pretrain", "growth", "sweep", "compare"}, str(file))
     comparisons = []
-    for block in content.get("compare", []):
+    blocks = content.get("compare", [])
+    if not isinstance(blocks, list):
+        raise ValueError(f"compare of {file} must be blocks, each begun with [[compare]], got {blocks!r}.")
+    for block in blocks:
         _check_keys(block, {f.name for f in fields(Comparison)}, f"[[compare]] of {file}")
-        lists = {name: tuple(block.get(name, ())) for name in ("tasks", "arms", "conditions")}
+        lists = {name: _as_tuple(block.get(name, ())) for name in ("tasks", "arms", "conditions")}
         for name, values in lists.items():
             if not values:
                 raise ValueError(f"A [[compare]] block of {file} has no {name}.")
         comparisons.append(Comparison(**lists))
     return StudySpec(
-        tuple(content.get("seeds", ())),
+        _as_tuple(content.get("seeds", ())),
         tuple(comparisons),
         _section(content, "budget", Budget, file) or Budget(),
         _section(content, "pretrain", Pretraining, file),
@@ -213,12 +247,19 @@ def _section[T](content: dict[str, Any], name: str, kind: type[T], file: Path) -
     values = content[name]
     _check_keys(values, {f.name for f in fields(kind)}, f"[{name}] of {file}")  # type: ignore[arg-type]
     try:
-        return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
+        return kind(**{key: _as_tuple(value) for key, value in values.items()})
     except TypeError as error:
         raise ValueError(f"[{name}] of {file} is incomplete: {error}.") from error
 
 
-def _check_keys(content: dict[str, Any], known: set[str], where: str) -> None:
+def _as_tuple(value: Any) -> Any:
+    """A list as a tuple; other values are checked where they are used."""
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _check_keys(content: Any, known: set[str], where: str) -> None:
+    if not isinstance(content, dict):
+        raise ValueError(f"{where} must be a table of entries ({', '.join(sorted(known))}), got {content!r}.")
     unknown = sorted(set(content) - known)
     if unknown:
         raise ValueError(
