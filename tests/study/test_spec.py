@@ -263,6 +263,30 @@ def test_a_warm_start_that_does_not_fit_is_refused(tmp_path, change, message):
         read_spec(write(tmp_path, GROWING.replace(*change)))
 
 
+@pytest.mark.parametrize(
+    ("azimuths", "message"),
+    [
+        ("[]", "at least one azimuth"),
+        ('["x"]', "azimuths must be a list of numbers, got"),
+        ("[1000]", "within -180 and 180 degrees, got"),
+        ("[nan]", "azimuths must be a list of numbers, got"),
+        ("[30, 30]", "names 30 more than once"),
+    ],
+)
+def test_azimuths_that_no_camera_has_are_refused(tmp_path, azimuths, message):
+    with pytest.raises(ValueError, match=message):
+        read_spec(write(tmp_path, GROWING.replace("[-30, 30]", azimuths)))
+
+
+def test_a_sweep_of_a_task_without_azimuths_is_refused(tmp_path):
+    libero = LIBERO.format(task="libero_goal/8-near", arm="geometry", condition="inside")
+    sweep = '[sweep]\nazimuths = [30]\narms = ["{arm}"]\n'
+    with pytest.raises(ValueError, match=r"sweep. is not possible on libero_goal/8-near"):
+        read_spec(write(tmp_path, libero + sweep.format(arm="geometry")))
+    both = libero + SPEC[SPEC.index("[[compare]]") :].replace('"geometry"', '"blind"')
+    assert read_spec(write(tmp_path, both + sweep.format(arm="blind"))).sweep  # of the other task alone
+
+
 LIBERO = """
 seeds = [0]
 [[compare]]

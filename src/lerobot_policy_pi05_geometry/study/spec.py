@@ -22,13 +22,14 @@ conditions = ["inside", "outside"]
 """
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from ..model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 from .arms import find_arm
-from .conditions import find_condition
+from .conditions import azimuth_condition, find_condition
 from .simulated_tasks import simulated_task
 from .value_checks import check_values
 
@@ -187,6 +188,8 @@ class StudySpec:
             for task in comparison.tasks:
                 for cameras in sorted(ranges):
                     simulated_task(task).camera_description(cameras)
+                if self.sweep is not None and set(self.sweep.arms) & set(comparison.arms):
+                    _check_azimuths(task, self.sweep.azimuths)
         if self.pretraining is None:
             return
         names = (*self.pretraining.tasks, *(task for comparison in self.comparisons for task in comparison.tasks))
@@ -195,6 +198,16 @@ class StudySpec:
             raise ValueError(
                 f"[pretrain] and [[compare]] need tasks of the same cameras, state and actions, got {', '.join(names)}."
             )
+
+
+def _check_azimuths(task: str, azimuths: Sequence[float]) -> None:
+    for degrees in azimuths:
+        try:
+            simulated_task(task).camera_description(azimuth_condition(degrees))
+        except ValueError as error:
+            raise ValueError(
+                f"[sweep] is not possible on {task}, which one of its arms is trained on: {error}"
+            ) from error
 
 
 def read_spec(path: str | Path) -> StudySpec:
