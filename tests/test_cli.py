@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 from pi05_geometry_cli import app
 
 from .checkpoint.conversion.sources import folder_contents, write_lerobot
+from .datasets import write_dataset
 
 
 def fail(*arguments: str) -> str:
@@ -53,6 +55,64 @@ def test_a_folder_without_a_dataset(arguments, tmp_path, monkeypatch):
     result = CliRunner().invoke(app, [*arguments, f"--dataset.root={tmp_path / 'data'}"])
     assert isinstance(result.exception, FileNotFoundError), result.output
     assert "holds no LeRobotDataset (meta/info.json is missing)" in str(result.exception)
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Nothing is trained: the runs that a study would start, and the command that its report would show."""
+    seen = {"runs": [], "commands": []}
+    monkeypatch.setattr("pi05_geometry_cli.studies._execute", lambda runs, *_: seen["runs"].extend(runs))
+    monkeypatch.setattr("lerobot_policy_pi05_geometry.study.launch.wait_for", lambda _: None)
+    for module in ("held_out_report.write_held_out_report", "report.write_report"):
+        name = f"lerobot_policy_pi05_geometry.study.{module}"
+        monkeypatch.setattr(name, lambda folder, runs, command: seen["commands"].append(command))
+    return seen
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--dataset.root={}", "--estimate"], "--estimate is an option of a simulated study"),
+        (["--dataset.root={}", "--smoke"], "--smoke is an option of a simulated study"),
+        (["--dataset.root={}", "--spec", "libero"], "--spec is an option of a simulated study"),
+        (["--dataset.root={}", "--seeds=0,x"], "--seeds must be whole numbers with commas between them, got '0,x'"),
+        (["--seeds", "0"], "--seeds is not an option of a simulated study"),
+        (["--arms=rgb"], "--arms is not an option of a simulated study"),
+        (["--steps=10"], "--steps is not an option of a simulated study"),
+        (["--pi05", "lerobot/pi05_base"], "--pi05 is not an option of a simulated study"),
+        (["--batch_size=8"], "--batch_size=8 is not an option of a simulated study"),
+        (
+            ["--smoke", "--spec", "missing.toml"],
+            "--smoke goes with --spec default or smoke or warm-start, got 'missing.toml'",
+        ),
+    ],
+)
+def test_a_study_refuses_the_options_of_the_other_kind(arguments, message, tmp_path, started):
+    root = write_dataset(tmp_path / "data")
+    result = CliRunner().invoke(
+        app, ["study", "--output", str(tmp_path / "out"), *(argument.format(root) for argument in arguments)]
+    )
+    assert isinstance(result.exception, ValueError), result.output
+    assert message in str(result.exception)
+    assert not started["runs"]
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("options", ["--arms rgb --seeds 5,6 --steps 111 --held-out 0.4 --frames 7", "--smoke"])
+def test_the_command_that_repeats_a_study_has_every_option(options, tmp_path, started):
+    root = write_dataset(tmp_path / "my data")
+    own = [] if options == "--smoke" else ["--dataset.root", str(root), "--dataset.repo_id", "me/mine"]
+    forwarded = ["--policy.image_resolution=[28, 28]"] if own else []
+    arguments = ["study", "--output", str(tmp_path / "out"), *own, *options.split(), *forwarded]
+    for _ in range(2):
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
+        assert shlex.split(started["commands"][-1])[0] == "pi05-geometry"
+        arguments = shlex.split(started["commands"][-1])[1:]  # repeated as it is shown
+    half = len(started["runs"]) // 2
+    assert [run.folder for run in started["runs"][:half]] == [run.folder for run in started["runs"][half:]]
+    assert started["commands"][0] == started["commands"][1]
 
 
 def test_a_conversion_that_fails_leaves_nothing(tmp_path):

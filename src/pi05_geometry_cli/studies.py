@@ -1,5 +1,6 @@
 """The commands that train and compare policies: demo, study."""
 
+import shlex
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -74,24 +75,36 @@ def study(
     With --dataset.root the study runs on your own dataset: it trains on most episodes and measures the action error on the
     others. All further options go to lerobot-train (`--policy.dtype=bfloat16 --policy.device=cuda --batch_size=8`).
     """
+    given = _given_options(context)
     if dataset_root is None:
-        if context.args:
+        foreign = [*(given[name][0] for name in _OF_OWN_DATA if name in given), *context.args]
+        if foreign:
             raise ValueError(
-                f"{context.args[0]} is not an option of a simulated study; put the budget into a --spec file."
+                f"{foreign[0]} is not an option of a simulated study; put the budget into a --spec file, or give your own data "
+                "with --dataset.root."
             )
-        name = {"warm-start": "warm-start-smoke"}.get(spec, "smoke") if smoke else spec
+        if smoke and spec not in _SMOKES:
+            raise ValueError(
+                f"--smoke goes with --spec {' or '.join(_SMOKES)}, got '{spec}'; leave out one of the two."
+            )
+        name = _SMOKES[spec] if smoke else spec
         if estimate:
             _print_estimate(name, output)
             return
-        command = f"pi05-geometry study --spec {name} --output {output}"
-        path = _simulated_study(name, output, workers, retry_crashed, command)
+        path = _simulated_study(name, output, workers, retry_crashed, _command(context))
     else:
         from lerobot_policy_pi05_geometry.study.held_out import held_out_runs
         from lerobot_policy_pi05_geometry.study.held_out_report import write_held_out_report
         from lerobot_policy_pi05_geometry.study.launch import rank, wait_for
 
+        foreign = [given[name][0] for name in _SIMULATED if name in given]
+        if foreign:
+            raise ValueError(f"{foreign[0]} is an option of a simulated study; leave it or --dataset.root out.")
         options = _forwarded(context.args)
-        numbers = [int(seed) for seed in seeds.split(",")]
+        try:
+            numbers = [int(seed) for seed in seeds.split(",")]
+        except ValueError as error:
+            raise ValueError(f"--seeds must be whole numbers with commas between them, got '{seeds}'.") from error
         runs = held_out_runs(
             output, dataset_root, dataset_repo_id, arms.split(","), numbers, options, steps, held_out, frames, pi05
         )
@@ -100,11 +113,31 @@ def study(
         _execute(runs, workers, retry_crashed)
         wait_for(runs)
         _print_crashed(runs)
-        start = [] if pi05 is None else [f"--pi05 {pi05}"]
-        command = " ".join(["pi05-geometry study", f"--dataset.root={dataset_root}", *start, *context.args])
-        path = write_held_out_report(output, runs, command) if rank() == 0 else None
+        path = write_held_out_report(output, runs, _command(context)) if rank() == 0 else None
     if path is not None:
         console.print(f"Open [bold]{path}[/bold]")
+
+
+_OF_OWN_DATA = ("dataset_repo_id", "pi05", "arms", "seeds", "steps", "held_out", "frames")
+_SIMULATED = ("spec", "estimate", "smoke")
+_SMOKES = {"default": "smoke", "smoke": "smoke", "warm-start": "warm-start-smoke"}
+
+
+def _given_options(context: typer.Context) -> dict[str, list[str]]:
+    """The options that stand on the command line: name -> how they are written, with their value."""
+    given = {}
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name)
+        if source is not None and source.name == "COMMANDLINE":
+            value = context.params[parameter.name]
+            given[parameter.name] = [parameter.opts[0], *([] if value is True else [str(value)])]
+    return given
+
+
+def _command(context: typer.Context) -> str:
+    """The command of a study with every option that was given, so that a reader of its report can repeat it."""
+    words = [word for option in _given_options(context).values() for word in option]
+    return shlex.join(["pi05-geometry", "study", *words, *context.args])
 
 
 def _forwarded(arguments: list[str]) -> dict[str, str]:
