@@ -12,9 +12,17 @@ REPO_ID = "local/tiny"
 
 
 def write_dataset(
-    root: Path, lengths: tuple[int, ...] = (9, 5, 12), videos: bool = False, size: int = 28, seed: int = 0
+    root: Path,
+    lengths: tuple[int, ...] = (9, 5, 12),
+    videos: bool = False,
+    size: int = 28,
+    seed: int = 0,
+    depth: tuple[str, ...] = (),
 ) -> Path:
-    """Episodes of these lengths; every image is a gradient of its own colour, which a video codec keeps apart."""
+    """Episodes of these lengths; every image is a gradient of its own colour, which a video codec keeps apart.
+
+    depth: keys of depth images, in millimetres, without LeRobot's flag.
+    """
     kind = "video" if videos else "image"
     features = {
         **{
@@ -24,6 +32,9 @@ def write_dataset(
                 "names": ["height", "width", "channels"],
             }
             for camera in ("front", "wrist")
+        },
+        **{
+            key: {"dtype": "image", "shape": (size, size, 1), "names": ["height", "width", "channels"]} for key in depth
         },
         "observation.state": {"dtype": "float32", "shape": (STATE_DIM,), "names": None},
         "action": {"dtype": "float32", "shape": (ACTION_DIM,), "names": None},
@@ -46,6 +57,7 @@ def add_episodes(root: Path, lengths: tuple[int, ...], size: int = 28, seed: int
 def _record(dataset: LeRobotDataset, lengths: tuple[int, ...], size: int, seed: int) -> None:
     random = np.random.default_rng(seed)
     ramp = np.linspace(0.2, 1.0, size)[:, None, None] * np.linspace(0.5, 1.0, size)[None, :, None]
+    depth = [key for key, feature in dataset.features.items() if tuple(feature["shape"]) == (size, size, 1)]
     for length in lengths:
         for _ in range(length):
             dataset.add_frame(
@@ -54,6 +66,7 @@ def _record(dataset: LeRobotDataset, lengths: tuple[int, ...], size: int, seed: 
                         f"observation.images.{camera}": (ramp * random.integers(40, 255, 3)).astype(np.uint8)
                         for camera in ("front", "wrist")
                     },
+                    **{key: random.integers(300, 1500, (size, size, 1)).astype(np.uint16) for key in depth},
                     "observation.state": random.uniform(-1, 1, STATE_DIM).astype(np.float32),
                     "action": random.uniform(-1, 1, ACTION_DIM).astype(np.float32),
                     "task": "push",

@@ -1,5 +1,6 @@
 """A study on a user's own dataset: what is held out, what is compared, and what comes out."""
 
+import json
 import os
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,6 +13,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
 
 from lerobot_policy_pi05_geometry.checkpoint.load import LoadedPolicy
+from lerobot_policy_pi05_geometry.geometry.calibration import Rig, write_calibration_file
+from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
 from lerobot_policy_pi05_geometry.sim.record import record
 from lerobot_policy_pi05_geometry.study.held_out import (
     ALL_CAMERAS,
@@ -22,6 +25,7 @@ from lerobot_policy_pi05_geometry.study.held_out import (
     hide_depth,
     view_conditions,
 )
+from lerobot_policy_pi05_geometry.study.own_data import geometry_cameras
 from lerobot_policy_pi05_geometry.study.warm_start import geometry_start
 from tests import commands
 from tests.checkpoint.conversion.sources import write_lerobot
@@ -75,6 +79,13 @@ def test_hidden_depth_measures_nothing_and_the_rest_stays():
         assert (shown[WRIST_DEPTH] == wrist).all(), condition
         assert shown["observation.state"] is batch["observation.state"]
     assert (batch[FRONT_DEPTH] == 1).all()
+
+
+def test_a_colour_image_that_is_named_as_depth_stays():
+    batch = {FRONT_DEPTH: torch.ones(2, 1, 4, 4), "observation.images.side_depth": torch.ones(2, 3, 4, 4)}
+    shown = hide_depth(batch, NO_DEPTH, {})
+    assert not shown[FRONT_DEPTH].any()
+    assert shown["observation.images.side_depth"].all()
 
 
 def test_what_cannot_be_studied_is_named(root, tmp_path):
@@ -194,3 +205,45 @@ def test_a_run_is_another_one_when_its_data_or_its_calibration_change(tmp_path):
     data = next((root / "data").rglob("*.parquet"))
     data.write_bytes(data.read_bytes()[::-1])
     assert folder() not in seen
+
+
+def write_depth(root, front):
+    """Five episodes with depth of two cameras, and their calibration. front: key of the front camera's depth."""
+    write_dataset(root, lengths=(6,) * 5, depth=(front, WRIST_DEPTH))
+    cameras = {
+        name: CameraCalibration([30.0, 30.0, 13.5, 13.5], [28, 28], np.eye(4).tolist()) for name in ("front", "wrist")
+    }
+    write_calibration_file(root / "meta" / "calibration.json", Rig(cameras))
+    return root
+
+
+def test_the_cameras_of_a_study_are_those_of_its_options(tmp_path):
+    """The front camera's depth has another name than LeRobot's, and not its flag."""
+    root, keys = write_depth(tmp_path / "data", "observation.images.range"), '{"front": "observation.images.range"}'
+
+    def views(**options):
+        return view_conditions(root, "local/mine", {f"policy.{name}": value for name, value in options.items()})
+
+    assert views() == [ALL_CAMERAS, NO_DEPTH]
+    assert views(depth_keys=keys) == [ALL_CAMERAS, f"{ONLY}front", f"{ONLY}wrist", NO_DEPTH]
+    assert views(depth_keys=keys, geometry_cameras='["front"]') == [ALL_CAMERAS, NO_DEPTH]
+    with pytest.raises(ValueError, match="geometry_cameras names side, but the data has depth from wrist only"):
+        views(geometry_cameras="[side]")
+    with pytest.raises(ValueError, match="A setting of the policy cannot be read"):
+        views(geometry_cameras="{3")
+    rays = {"policy.geometry_source": "rays", "policy.depth_keys": keys}
+    assert geometry_cameras(root, "local/mine", rays) == ["front", "wrist"]
+    assert geometry_cameras(root, "local/mine", rays | {"policy.geometry_cameras": "[wrist]"}) == ["wrist"]
+
+
+@pytest.mark.train
+def test_a_pi05_is_converted_for_the_cameras_of_the_options(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["train"])  # training sets them
+    root, pi05 = write_depth(tmp_path / "data", FRONT_DEPTH), write_lerobot(tmp_path / "pi05")
+    options = {**OPTIONS, "policy.geometry_cameras": '["front"]'}
+    (run,) = held_out_runs(tmp_path / "out", root, "local/mine", ["geometry"], [0], options, 2, 0.4, 3, str(pi05))
+    run.folder.mkdir(parents=True)
+    run.prepare(lambda *_: None)
+    run.train(tmp_path / "training")
+    config = json.loads((tmp_path / "training/checkpoints/last/pretrained_model/config.json").read_text())
+    assert (config["geometry_cameras"], config["geometry_pending"]) == (["front"], 0)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+import yaml
 from lerobot.configs import PreTrainedConfig
 
 from ..configuration_pi05_geometry import PI05GeometryConfig
@@ -70,8 +71,8 @@ def configuration(options: Mapping[str, str]) -> PI05GeometryConfig:
             assert isinstance(found, PI05GeometryConfig)
             return found
         return draccus.parse(PI05GeometryConfig, args=arguments)
-    except draccus.utils.DecodingError as error:
-        raise ValueError(f"A setting of the policy cannot be read: {error}.") from error
+    except (draccus.utils.DecodingError, yaml.YAMLError) as error:
+        raise ValueError(f"A setting of the policy cannot be read: {' '.join(str(error).split())}.") from error
     except draccus.ParsingError as error:  # the configuration's own sentence
         raise ValueError(str(error.__cause__ or error)) from error
 

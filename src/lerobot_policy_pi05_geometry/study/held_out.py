@@ -23,9 +23,9 @@ from torch.utils.data import default_collate
 
 from ..checkpoint.load import LoadedPolicy, load_policy
 from ..dataset_folder import require_dataset
-from ..geometry.keys import DEPTH_SUFFIX, depth_features, find_depth_key, is_depth_key
+from ..geometry.keys import DEPTH_SUFFIX, find_depth_key, is_depth_key
 from .arms import DEPTH, blind_inputs, find_arm
-from .own_data import dataset_identity
+from .own_data import dataset_identity, depth_cameras, geometry_cameras
 from .runs import ReportProgress, Run, option_list, versions
 from .training import train_with
 from .warm_start import make_start, remaining_options
@@ -87,9 +87,8 @@ class HeldOutRun(Run):
     def prepare(self, report_progress: ReportProgress) -> None:
         """Convert the π0.5 that it starts from. The dataset exists."""
         if self.pi05 is not None and not self.checkpoint.exists():
-            make_start(
-                self.pi05, self.start, self._options(), depth_cameras(self.dataset_root, self.repo_id), self.seed
-            )
+            cameras = geometry_cameras(self.dataset_root, self.repo_id, self._options())
+            make_start(self.pi05, self.start, self._options(), cameras, self.seed)
 
     def train(self, output: Path) -> None:
         videos = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).video_keys
@@ -217,11 +216,11 @@ def held_out_runs(
             raise ValueError(f"Arm '{name}' needs other camera poses in its data, which only the simulator has.")
     if pi05 is not None and Path(pi05).is_dir():
         pi05 = str(Path(pi05).absolute())
-    views = view_conditions(dataset_root, repo_id)
+    views = view_conditions(dataset_root, repo_id, options)
     if len(views) == 1 and any(DEPTH in find_arm(name).reads for name in arms):
         raise ValueError(
             f"{dataset_root} has no depth (observation.images.<camera>{DEPTH_SUFFIX}), which arm 'geometry' and its variants "
-            "read; record depth, or choose other --arms."
+            "read; record depth, name its key by --policy.depth_keys, or choose other --arms."
         )
     return [
         HeldOutRun(
@@ -233,9 +232,9 @@ def held_out_runs(
     ]  # fmt: skip
 
 
-def view_conditions(root: Path, repo_id: str) -> list[str]:
-    """Conditions for an arm with depth: all depth cameras, each one alone, and none."""
-    cameras = depth_cameras(root, repo_id)
+def view_conditions(root: Path, repo_id: str, options: Mapping[str, str] = {}) -> list[str]:
+    """Conditions for an arm with depth: all depth cameras that it reads, each one alone, and none."""
+    cameras = depth_cameras(root, repo_id, options)
     single = [f"{ONLY}{camera}" for camera in cameras] if len(cameras) > 1 else []
     return [ALL_CAMERAS, *single, NO_DEPTH] if cameras else [ALL_CAMERAS]
 
@@ -246,24 +245,24 @@ def _description_of(checkpoint: str) -> list[Any]:
     return [checkpoint, *((file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files)]
 
 
-def depth_cameras(root: Path, repo_id: str) -> list[str]:
-    """The dataset's cameras with depth, sorted by name."""
-    return sorted(depth_features(LeRobotDatasetMetadata(repo_id, root=root).features, {}))
-
-
 def hide_depth(batch: dict[str, Any], condition: str, depth_keys: Mapping[str, str]) -> dict[str, Any]:
-    """The batch with the depth of all cameras but the condition's set to zero (no measurement).
+    """The batch with the depth of all cameras but the condition's set to zero (no measurement); images stay, whatever their name.
 
-    depth_keys: of the policy's configuration.
+    batch: images channel-first, as a dataset gives them. depth_keys: of the policy's configuration.
     """
     if condition == ALL_CAMERAS:
         return batch
     only = condition.startswith(ONLY)
     kept = find_depth_key(condition.removeprefix(ONLY), batch, depth_keys) if only else None
     return {
-        key: torch.zeros_like(value) if is_depth_key(key, depth_keys) and key != kept else value
+        key: torch.zeros_like(value) if _is_depth(key, value, depth_keys) and key != kept else value
         for key, value in batch.items()
     }
+
+
+def _is_depth(key: str, value: Any, depth_keys: Mapping[str, str]) -> bool:
+    """Whether a batch entry is depth, and not a depth map that was turned into colours, (..., 3, H, W)."""
+    return is_depth_key(key, depth_keys) and value.shape[-3] != 3
 
 
 @torch.no_grad()

@@ -6,6 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
+
+from ..configuration_pi05_geometry import PI05GeometryConfig
+from ..geometry.keys import camera_of, depth_features, select_cameras
+from ..planner.options import configuration
+
 _END = 2**20  # bytes hashed of each end of a large file
 
 
@@ -15,6 +21,33 @@ def dataset_identity(root: Path, options: Mapping[str, str]) -> dict[str, Any]:
         **{folder: _identity(root / folder) for folder in ("meta", "data", "videos")},
         **{name: _identity(Path(value)) for name, value in options.items() if os.path.exists(value)},
     }
+
+
+def depth_cameras(root: Path, repo_id: str, options: Mapping[str, str]) -> list[str]:
+    """The cameras whose depth a policy reads: those of --policy.geometry_cameras, or all of the dataset, sorted by name.
+
+    options: of lerobot-train, without the dashes. Raises ValueError if the dataset has depth, but not of a wanted camera.
+    """
+    settings, features = _camera_settings(options), LeRobotDatasetMetadata(repo_id, root=root).features
+    found = depth_features(features, settings.depth_keys)
+    return list(select_cameras(found, settings.geometry_cameras if found else None, "depth"))
+
+
+def geometry_cameras(root: Path, repo_id: str, options: Mapping[str, str]) -> list[str]:
+    """The cameras that geometry comes from with an arm's options: with depth, or for rays with RGB images."""
+    settings, features = _camera_settings(options), LeRobotDatasetMetadata(repo_id, root=root).features
+    if options.get("policy.geometry_source") != "rays":
+        return depth_cameras(root, repo_id, options)
+    depth = depth_features(features, settings.depth_keys).values()
+    images = [key for key, feature in features.items() if feature["dtype"] in ("image", "video") and key not in depth]
+    return list(select_cameras({camera_of(key): key for key in images}, settings.geometry_cameras, "RGB images"))
+
+
+def _camera_settings(options: Mapping[str, str]) -> PI05GeometryConfig:
+    """A configuration with those of the options that choose cameras."""
+    return configuration(
+        {n: options[f"policy.{n}"] for n in ("depth_keys", "geometry_cameras") if f"policy.{n}" in options}
+    )
 
 
 def _identity(path: Path) -> list[Any]:
