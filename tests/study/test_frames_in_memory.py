@@ -6,6 +6,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_policy_pi05_geometry.sim.record import record
 from lerobot_policy_pi05_geometry.study.frames_in_memory import FramesInMemory
+from lerobot_policy_pi05_geometry.study.training import train_with
 
 pytestmark = pytest.mark.sim
 
@@ -39,3 +40,21 @@ def test_observation_histories_are_refused(root):
     dataset = LeRobotDataset("local/frames", root=root, delta_timestamps={"observation.state": [-0.05, 0.0]})
     with pytest.raises(ValueError, match="use lerobot-train"):
         FramesInMemory(dataset)
+
+
+def training(root, output, *more):
+    return [
+        "--policy.type=pi05_geometry", "--policy.geometry_source=none", "--policy.device=cpu", "--policy.push_to_hub=false",
+        "--policy.paligemma_variant=tiny", "--policy.action_expert_variant=tiny", "--policy.image_resolution=[28, 28]",
+        "--policy.chunk_size=4", "--policy.n_action_steps=4", "--dataset.repo_id=local/frames", f"--dataset.root={root}",
+        f"--output_dir={output}", "--batch_size=2", "--steps=2", "--num_workers=0", *more,
+    ]  # fmt: skip
+
+
+@pytest.mark.train
+def test_transformed_images_are_read_from_disk_and_streamed_ones_refused(root, tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["train"])  # training sets them
+    train_with(training(root, tmp_path / "run", "--dataset.image_transforms.enable=true"))
+    assert (tmp_path / "run/checkpoints/last/pretrained_model/model.safetensors").exists()
+    with pytest.raises(ValueError, match=r"leave --dataset.streaming out"):
+        train_with(training(root, tmp_path / "other", "--dataset.streaming=true"))

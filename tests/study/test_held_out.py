@@ -89,8 +89,8 @@ def test_a_colour_image_that_is_named_as_depth_stays():
 
 
 def test_what_cannot_be_studied_is_named(root, tmp_path):
-    def runs(folder=root, arms=("geometry",), held_out=0.2, seeds=(0,), steps=4, frames=3):
-        return held_out_runs(tmp_path, folder, "local/mine", arms, seeds, {}, steps, held_out, frames)
+    def runs(folder=root, arms=("geometry",), held_out=0.2, seeds=(0,), steps=4, frames=3, **options):
+        return held_out_runs(tmp_path, folder, "local/mine", arms, seeds, options, steps, held_out, frames)
 
     assert view_conditions(root, "local/mine") == [ALL_CAMERAS, NO_DEPTH]
     assert runs()[0].distinct_conditions() == [ALL_CAMERAS, NO_DEPTH]
@@ -105,6 +105,8 @@ def test_what_cannot_be_studied_is_named(root, tmp_path):
         runs(seeds=(0, 0))
     with pytest.raises(ValueError, match="--arms must name at least one of them, and each once, got rgb, rgb"):
         runs(arms=("rgb", "rgb"))
+    with pytest.raises(ValueError, match=r"leave --dataset.streaming out"):
+        runs(**{"dataset.streaming": "true"})
     for name in ("frames", "steps"):
         with pytest.raises(ValueError, match=f"--{name} must be at least 1, got 0"):
             runs(**{name: 0})

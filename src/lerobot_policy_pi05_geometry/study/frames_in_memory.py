@@ -14,6 +14,7 @@ from accelerate.utils import DistributedDataParallelKwargs
 from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.scripts.lerobot_train import train
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
@@ -74,9 +75,19 @@ class InMemoryAccelerator(Accelerator):
 
 @parser.wrap()
 def train_in_memory(cfg: TrainPipelineConfig) -> None:
-    """`lerobot-train`, with the same arguments, for a dataset whose frames fit into memory."""
+    """`lerobot-train`, with the same arguments, for a dataset whose frames fit into memory.
+
+    With image transforms every sample is another image, so LeRobot reads it from disk. Raises ValueError for a streamed dataset.
+    """
+    if cfg.dataset.streaming:
+        raise ValueError(
+            "The frames of a streamed dataset cannot be kept in memory; leave --dataset.streaming out, or use lerobot-train."
+        )
     cfg.validate()
     refuse_augmentation(cfg)
+    if cfg.dataset.image_transforms.enable:
+        train(cfg)
+        return
     train_with_accelerator(cfg, partial(_make_accelerator, cfg))
 
 
