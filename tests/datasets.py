@@ -18,10 +18,11 @@ def write_dataset(
     size: int = 28,
     seed: int = 0,
     depth: tuple[str, ...] = (),
+    tasks: tuple[str, ...] = (),
 ) -> Path:
     """Episodes of these lengths; every image is a gradient of its own colour, which a video codec keeps apart.
 
-    depth: keys of depth images, in millimetres, without LeRobot's flag.
+    depth: keys of depth images, in millimetres, without LeRobot's flag. tasks: of each episode; by default all are "push".
     """
     kind = "video" if videos else "image"
     features = {
@@ -40,7 +41,7 @@ def write_dataset(
         "action": {"dtype": "float32", "shape": (ACTION_DIM,), "names": None},
     }
     dataset = LeRobotDataset.create(REPO_ID, fps=FPS, features=features, root=root, use_videos=videos)
-    _record(dataset, lengths, size, seed)
+    _record(dataset, lengths, size, seed, tasks)
     dataset.finalize()
     write_frame_quantiles(root, REPO_ID, ("observation.state", "action"))
     return root
@@ -54,11 +55,13 @@ def add_episodes(root: Path, lengths: tuple[int, ...], size: int = 28, seed: int
     return root
 
 
-def _record(dataset: LeRobotDataset, lengths: tuple[int, ...], size: int, seed: int) -> None:
+def _record(
+    dataset: LeRobotDataset, lengths: tuple[int, ...], size: int, seed: int, tasks: tuple[str, ...] = ()
+) -> None:
     random = np.random.default_rng(seed)
     ramp = np.linspace(0.2, 1.0, size)[:, None, None] * np.linspace(0.5, 1.0, size)[None, :, None]
     depth = [key for key, feature in dataset.features.items() if tuple(feature["shape"]) == (size, size, 1)]
-    for length in lengths:
+    for length, task in zip(lengths, tasks or ["push"] * len(lengths), strict=True):
         for _ in range(length):
             dataset.add_frame(
                 {
@@ -69,7 +72,7 @@ def _record(dataset: LeRobotDataset, lengths: tuple[int, ...], size: int, seed: 
                     **{key: random.integers(300, 1500, (size, size, 1)).astype(np.uint16) for key in depth},
                     "observation.state": random.uniform(-1, 1, STATE_DIM).astype(np.float32),
                     "action": random.uniform(-1, 1, ACTION_DIM).astype(np.float32),
-                    "task": "push",
+                    "task": task,
                 }
             )
         dataset.save_episode()

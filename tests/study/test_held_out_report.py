@@ -2,15 +2,45 @@
 
 import numpy as np
 import pytest
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.factory import make_train_eval_datasets
 
+from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.study.held_out import held_out_runs
 from lerobot_policy_pi05_geometry.study.held_out_report import collect, headline, write_held_out_report
+from lerobot_policy_pi05_geometry.study.own_data import Split, split_episodes
 from tests.datasets import ACTION_DIM, write_dataset
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
     return write_dataset(tmp_path_factory.mktemp("data") / "mine")
+
+
+def test_the_numbers_of_episodes_are_lerobots(tmp_path, caplog):
+    """Their share is rounded up for each task, so a task with one episode is not trained on."""
+    root = write_dataset(tmp_path / "mine", lengths=(5,) * 6, tasks=("a", "b", "a", "a", "c", "a"))
+    (run,) = held_out_runs(tmp_path / "out", root, "local/mine", ["rgb"], [0], {}, 2, 0.2, 3)
+    assert run.split == Split(trained=3, held_out=3, untrained=("b", "c"))
+    assert run.evaluation_size == 3 * 3
+    assert "Every episode of 'b', 'c' is held out" in caplog.text
+    config = TrainPipelineConfig(
+        dataset=DatasetConfig("local/mine", root=str(root), eval_split=0.2),
+        policy=PI05GeometryConfig(device="cpu", push_to_hub=False),
+    )
+    trained, held_out = make_train_eval_datasets(config)
+    assert (trained.num_episodes, held_out.num_episodes) == (run.split.trained, run.split.held_out)
+    run.folder.mkdir(parents=True)
+    run.log.touch()
+    np.savez_compressed(run.outcome("all-cameras"), errors=np.ones((3, 4, ACTION_DIM)))
+    page = write_held_out_report(tmp_path / "out", [run], "pi05-geometry study").read_text()
+    assert "3 of 6 episodes were held out, the last ones of each task" in page
+    assert "no policy was trained on them: b, c." in page
+    chosen = {"dataset.episodes": "[1, 4]"}
+    assert split_episodes(root, "local/mine", 0.2, {"dataset.episodes": "[0, 2, 4]"}) == Split(1, 2, ("c",))
+    with pytest.raises(ValueError, match=r"Of the 2 episodes in .* none is left to train on"):
+        held_out_runs(tmp_path / "out", root, "local/mine", ["rgb"], [0], chosen, 2, 0.2, 3)
 
 
 def executed(root, output, errors, episodes, crashed=()):

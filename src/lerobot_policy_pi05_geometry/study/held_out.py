@@ -5,7 +5,7 @@ another path than the recorded one, and small errors may add up to failure. The 
 predicted.
 """
 
-import math
+import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,10 +25,12 @@ from ..checkpoint.load import LoadedPolicy, load_policy
 from ..dataset_folder import require_dataset
 from ..geometry.keys import DEPTH_SUFFIX, find_depth_key, is_depth_key
 from .arms import DEPTH, blind_inputs, find_arm
-from .own_data import dataset_identity, depth_cameras, geometry_cameras
+from .own_data import Split, dataset_identity, depth_cameras, geometry_cameras, split_episodes
 from .runs import ReportProgress, Run, option_list, versions
 from .training import train_with
 from .warm_start import make_start, remaining_options
+
+logger = logging.getLogger(__name__)
 
 ALL_CAMERAS, NO_DEPTH, ONLY = "all-cameras", "no-depth", "only-"
 _NOISE_SEED = 0  # the noise that a chunk starts from depends on the episode only, so it is the same for every arm
@@ -61,8 +63,12 @@ class HeldOutRun(Run):
 
     @cached_property
     def evaluation_size(self) -> int:
-        episodes = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).total_episodes
-        return self.frames * math.ceil(self.held_out * episodes)
+        return self.frames * self.split.held_out
+
+    @cached_property
+    def split(self) -> Split:
+        """Which episodes are trained on and which held out, in numbers."""
+        return split_episodes(self.dataset_root, self.repo_id, self.held_out, dict(self.options))
 
     def description(self) -> dict[str, Any]:
         return {
@@ -216,6 +222,12 @@ def held_out_runs(
     for name in arms:
         if find_arm(name).cameras != "train" or find_arm(name).adapts is not None:
             raise ValueError(f"Arm '{name}' needs other camera poses in its data, which only the simulator has.")
+    split = split_episodes(dataset_root, repo_id, held_out, options)
+    if split.untrained:
+        logger.warning(
+            "Every episode of %s is held out, so no policy is trained on it; record more of it, or leave it out with "
+            "--dataset.episodes.", ", ".join(f"'{task}'" for task in split.untrained),
+        )  # fmt: skip
     if pi05 is not None and Path(pi05).is_dir():
         pi05 = str(Path(pi05).absolute())
     views = view_conditions(dataset_root, repo_id, options)

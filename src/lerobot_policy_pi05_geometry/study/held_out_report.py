@@ -43,11 +43,15 @@ def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str
     page = Page(f"Does geometry help on {runs[0].dataset_root.name}?")
     page.lead(headline(errors))
     seeds, first = len({run.seed for run in runs}), runs[0]
+    split = first.split
     page.text(
-        f"{len(runs)} training runs of {first.steps} steps, {seeds} training seed{'s' if seeds > 1 else ''}; the last "
-        f"{first.held_out:.0%} of the episodes were held out. Errors are mean absolute errors of predicted action chunks, in "
+        f"{len(runs)} training runs of {first.steps} steps, {seeds} training seed{'s' if seeds > 1 else ''}; "
+        f"{split.held_out} of {split.trained + split.held_out} episodes were held out, the last ones of each task. Errors are "
+        "mean absolute errors of predicted action chunks, in "
         f"standard deviations of the recorded actions{_about_intervals(errors)}"
     )
+    if split.untrained:
+        page.text(f"Held out whole, so that no policy was trained on them: {', '.join(split.untrained)}.")
     crashed = [run.name for run in runs if run.crash.exists()]
     if crashed:
         page.text(f"Crashed runs, not in the figures: {', '.join(crashed)}.")

@@ -1,8 +1,12 @@
 """What a study reads of a user's dataset before it trains on it."""
 
 import hashlib
+import json
+import math
 import os
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +25,35 @@ def dataset_identity(root: Path, options: Mapping[str, str]) -> dict[str, Any]:
         **{folder: _identity(root / folder) for folder in ("meta", "data", "videos")},
         **{name: _identity(Path(value)) for name, value in options.items() if os.path.exists(value)},
     }
+
+
+@dataclass(frozen=True)
+class Split:
+    """Numbers of episodes to train on and held out; untrained: tasks of which every episode is held out."""
+
+    trained: int
+    held_out: int
+    untrained: tuple[str, ...]
+
+
+def split_episodes(root: Path, repo_id: str, share: float, options: Mapping[str, str]) -> Split:
+    """How LeRobot divides a dataset: of each task it holds out the last episodes, their share rounded up.
+
+    options: of lerobot-train; `dataset.episodes` are those that it reads. Raises ValueError if none is left to train on.
+    """
+    tasks = list(LeRobotDatasetMetadata(repo_id, root=root).episodes["tasks"])
+    chosen = json.loads(options.get("dataset.episodes", "null"))
+    of_task = Counter(
+        tasks[episode][0] if tasks[episode] else "" for episode in (range(len(tasks)) if chosen is None else chosen)
+    )
+    held_out = {task: math.ceil(count * share) for task, count in of_task.items()}
+    trained = of_task.total() - sum(held_out.values())
+    if trained == 0:
+        raise ValueError(
+            f"Of the {of_task.total()} episodes in {root} none is left to train on: the last ones of each task are held out, "
+            f"{share:.0%} of them rounded up; record more of each task, or give a smaller --held-out."
+        )
+    return Split(trained, sum(held_out.values()), tuple(task for task in of_task if held_out[task] == of_task[task]))
 
 
 def depth_cameras(root: Path, repo_id: str, options: Mapping[str, str]) -> list[str]:
