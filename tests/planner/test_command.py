@@ -154,3 +154,27 @@ def test_the_released_size_without_its_memory():
     table = {row.split("│")[1].strip(): row.split("│")[2].strip() for row in shown.splitlines() if row.count("│") == 4}
     assert (table["weights"], table["gradients"], table["optimiser"]) == ("12.50", "12.09", "24.18")
     assert int(resident) < 2 * 2**20
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--policy.geometry_cameras=[front]"],
+        ["--policy.geometry_cameras=[front]", "--policy.geometry_source=rays"],
+        ["--policy.geometry_cameras=[camera1]", "--policy.geometry_source=rays"],
+        ["--policy.geometry_source=rays"],
+        ["--policy.geometry_source=da3", "--policy.geometry_cameras=[front, side, wrist]"],
+        ["--policy.geometry_source=da3", "--policy.geometry_tokens=rays"],
+    ],
+    ids=lambda options: " ".join(options),
+)
+def test_what_can_be_trained_can_be_planned(options):
+    """The data of a plan is made up, so it has the cameras and the calibration that the settings ask for."""
+    assert "peak" in plan(*TINY, *options)
+
+
+def test_the_calibration_of_cameras_that_are_made_up_is_not_read():
+    """It stays in the command that trains."""
+    given = "--policy.calibration_path=of_my_robot.json"
+    assert "peak" in plan(*TINY, given)
+    assert given in plan(*TINY, given, "--gpu", "8", "--proposals", "1")

@@ -47,7 +47,10 @@ def run(arguments: Sequence[str], data: Data, wish: Wish) -> Iterator[Renderable
 
     def make_config(changes: Mapping[str, Any]) -> PI05GeometryConfig:
         text = {name: str(value).lower() for name, value in changes.items()}
-        return complete(configuration(text | options), data.cameras, data.depth_cameras, data.image_size)
+        found = configuration(text | options)
+        if "path" not in options:
+            found.calibration_path = None  # of cameras that are made up here; memory does not depend on it
+        return complete(found, data.cameras, data.depth_cameras, data.image_size)
 
     config = make_config({})
     budget = None if wish.gpu is None else gpu_bytes(wish.gpu)
@@ -61,7 +64,9 @@ def run(arguments: Sequence[str], data: Data, wish: Wish) -> Iterator[Renderable
         inference = FakePolicy(acting(make_config({})), None, da3).inference(Load(1, None, prompt))
         yield split_table({"training": training, "inference": inference})
     else:
-        yield from _proposals(make_config, load, budget, Fixed(typed(options, config), rank), da3, wish, options)
+        yield from _proposals(
+            make_config, load, budget, Fixed(typed(options, configuration(options)), rank), da3, wish, options
+        )
     if wish.explain:
         yield explanation(config, load)
 
