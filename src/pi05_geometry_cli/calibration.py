@@ -119,14 +119,14 @@ def arm(
 
     from lerobot_policy_pi05_geometry.dataset_folder import require_dataset
     from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
-    from lerobot_policy_pi05_geometry.robot.calibrate import keep_offsets, make_arm, state_names
+    from lerobot_policy_pi05_geometry.robot.calibrate import keep_offsets, make_arm, named_state
     from lerobot_policy_pi05_geometry.robot.link_files import read_links
 
     pairs = [text.partition("=") for text in joint or []]
     if any(not sign or not entry for _, sign, entry in pairs):
         raise ValueError("--joint is written JOINT=STATE_ENTRY, as elbow=elbow_flex.pos.")
     calibration = _read(file)
-    names = state_names(LeRobotDataset(dataset_repo_id, root=require_dataset(dataset_root)))
+    names = named_state(LeRobotDataset(dataset_repo_id, root=require_dataset(dataset_root)))
     made = make_arm(read_links(model, base), names, {left: right for left, _, right in pairs}, unit)
     known = [each.joint for each in made.joints]
     if set(flip or []) - set(known):
@@ -267,7 +267,7 @@ def scene(
 
     from lerobot_policy_pi05_geometry.dataset_folder import require_dataset
     from lerobot_policy_pi05_geometry.geometry.calibration import read_calibration_file
-    from lerobot_policy_pi05_geometry.geometry.dataset_calibration import read_dataset_calibration
+    from lerobot_policy_pi05_geometry.geometry.dataset_calibration import check_state_names, read_dataset_calibration
     from lerobot_policy_pi05_geometry.geometry.dataset_depth import codec_bounds
     from lerobot_policy_pi05_geometry.geometry.keys import depth_features, find_depth_keys
     from lerobot_policy_pi05_geometry.inspect.inspection import frame_batch
@@ -277,6 +277,7 @@ def scene(
     features = dataset.meta.features
     depth_keys = find_depth_keys(features, {})
     calibration = read_dataset_calibration(dataset.meta, depth_keys) if file is None else read_calibration_file(file)
+    check_state_names(calibration, features)
     bounds = codec_bounds(features, list(depth_features(features, depth_keys)), depth_keys)
     ends = {camera: (low, high) for camera, (low, high) in bounds.items()}
     seen = scene_of(frame_batch(dataset, frame), calibration, bounds=ends, depth_keys=depth_keys)

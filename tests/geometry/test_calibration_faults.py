@@ -1,27 +1,43 @@
 """Calibrations and poses that do not belong to the images, or to the robot: refused, or taken as they are meant."""
 
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from typer.testing import CliRunner
 
-from lerobot_policy_pi05_geometry.geometry.calibration import Rig, parse_calibration
-from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration
+from lerobot_policy_pi05_geometry.geometry.calibration import (
+    Calibration,
+    Rig,
+    parse_calibration,
+    write_calibration_file,
+)
+from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, Mount
+from lerobot_policy_pi05_geometry.geometry.dataset_calibration import check_state_names, write_dataset_calibration
 from lerobot_policy_pi05_geometry.geometry.keys import RIG
 from lerobot_policy_pi05_geometry.geometry.placed_camera import PlacedCamera
+from lerobot_policy_pi05_geometry.geometry.resolve import resolve
 from lerobot_policy_pi05_geometry.geometry.rigid import FARTHEST, identity_rows
+from pi05_geometry_cli import app
 
 from ..entry_points import (
     FRONT,
     FRONT_DEPTH,
+    WRIST_DEPTH,
     WRIST_POSE,
     make_batch,
     make_calibration,
+    make_config,
     make_features,
     make_observation,
     make_policy,
     without,
 )
 from ..serving.running import make_rigs
+from .arms import STATE_NAMES, so101_like
 
 
 def placed(size: tuple[int, int], rotation: int = 0) -> PlacedCamera:
@@ -84,6 +100,58 @@ def test_a_translation_in_millimetres_is_refused():
 def test_rigs_have_numbers():
     with pytest.raises(ValueError, match="give a whole number as its name"):
         parse_calibration({"version": 2, "frame": "base", "rigs": {"left": {"cameras": {}}}}, "file")
+
+
+# --- which entries of the state an arm's joints are -----------------------------------------------------------------
+
+GRIPPER_FIRST = ["gripper.pos", *STATE_NAMES[:5]]
+
+
+def on_arm() -> dict[str, CameraCalibration]:
+    cameras = make_calibration()
+    return cameras | {"wrist": replace(cameras["wrist"], mount=Mount("arm", "gripper", identity_rows()))}
+
+
+def features_with(names) -> dict:
+    info = {"is_depth_map": True, "depth_unit": "m"}
+    images = {key: {"dtype": "image", "shape": [12, 16, 1], "info": info} for key in (FRONT_DEPTH, WRIST_DEPTH)}
+    return {**images, "observation.state": {"dtype": "float32", "shape": [6], "names": names}}
+
+
+def test_an_arm_whose_joints_are_other_entries_of_the_state_is_refused(tmp_path):
+    """A wrist camera would stand where another arm's hand is, without a word."""
+    calibration, folder = Calibration(on_arm(), {"arm": so101_like()}), tmp_path / "data" / "meta"
+    folder.mkdir(parents=True)
+    write_calibration_file(tmp_path / "calibration.json", calibration)
+    command = ["store-calibration", str(tmp_path / "calibration.json"), f"--dataset.root={tmp_path / 'data'}"]
+    for names, refused in ((GRIPPER_FIRST, True), (STATE_NAMES, False)):
+        (folder / "info.json").write_text(json.dumps({"features": features_with(names)}))
+        result = CliRunner().invoke(app, command)
+        assert (result.exit_code != 0) == refused, result.output
+    said = r"joint 'shoulder_pan' of arm 'arm' is state entry 0, 'shoulder_pan.pos', but the dataset's state has gripper.pos, "
+    inputs = make_features()[0] | {"observation.state": PolicyFeature(FeatureType.STATE, (6,))}
+    config = make_config(calibration=calibration.cameras, arms=calibration.arms, input_features=inputs)
+    config.validate_features()
+    meta = SimpleNamespace(features=features_with(GRIPPER_FIRST), root=tmp_path, robot_type=None)
+    with pytest.raises(ValueError, match=said):
+        resolve(config, meta)
+    meta.features = features_with(STATE_NAMES)
+    resolve(config, meta)
+
+
+def test_state_entries_are_compared_on_every_rig_and_only_where_they_are_named(tmp_path):
+    two = Calibration(rigs={"0": Rig(make_calibration()), "1": Rig(on_arm(), {"arm": so101_like()})})
+    with pytest.raises(ValueError, match="is state entry 0"):
+        check_state_names(two, features_with(GRIPPER_FIRST))
+    with pytest.raises(ValueError, match="is state entry 0"):
+        check_state_names(two, features_with({"motors": GRIPPER_FIRST}))
+    check_state_names(two, features_with({"motors": STATE_NAMES}))
+    for unnamed in (None, ["state"]):
+        check_state_names(two, features_with(unnamed))
+    unused = Calibration(make_calibration(), {"arm": so101_like()})  # no camera is on it
+    check_state_names(unused, features_with(GRIPPER_FIRST))
+    with pytest.raises(FileNotFoundError):
+        write_dataset_calibration(tmp_path, unused)
 
 
 # --- which rig ----------------------------------------------------------------------------------------------------

@@ -74,14 +74,40 @@ def read_dataset_calibration(dataset_meta: Any, depth_keys: Mapping[str, str]) -
     return Calibration(in_file.cameras | in_info.cameras, in_file.arms | in_info.arms, in_file.rigs | in_info.rigs)
 
 
+def state_names(features: Mapping[str, Any]) -> list[str] | None:
+    """Names of the entries of a dataset's state, in their order; None if its features do not name each of them."""
+    state = features.get(_STATE) or {}
+    names = state.get("names")
+    if isinstance(names, Mapping):  # older datasets name the group: {"motors": [...]}
+        names = next(iter(names.values()), None)
+    if not isinstance(names, list | tuple) or len(names) != state["shape"][0]:
+        return None
+    return [str(name) for name in names]
+
+
+def check_state_names(rig: Rig, features: Mapping[str, Any]) -> None:
+    """Raise ValueError unless the arms that carry a camera, of all rigs, read the entries of this dataset's state that they know.
+
+    A dataset that does not name the entries of its state cannot be checked.
+    """
+    names = state_names(features)
+    if names is None:
+        return
+    for each in (rig, *(rig.rigs.values() if isinstance(rig, Calibration) else ())):
+        for name in {camera.mount.arm: None for camera in each.cameras.values() if camera.mount is not None}:
+            each.arms[name].check_state_names(name, names)
+
+
 def write_dataset_calibration(root: Path, rig: Rig, depth_keys: Mapping[str, str] | None = None) -> None:
     """Store the calibration of cameras and arms in the `info` of a dataset's features, where LeRobot's tools keep it.
 
     depth_keys: as in `read_dataset_calibration`. Raises ValueError for a camera that the
-    dataset does not have, FileNotFoundError if there is no dataset at `root`.
+    dataset does not have and an arm whose joints are other entries of its state, FileNotFoundError if there is no dataset
+    at `root`.
     """
     path = require_dataset(root) / INFO_FILE
     info = json.loads(path.read_text())
+    check_state_names(rig, info["features"])
     if isinstance(rig, Calibration) and rig.rigs:
         if RIG not in info["features"]:
             raise ValueError(f"The dataset at {root} has no {RIG}, by which a frame says which rig it is from.")

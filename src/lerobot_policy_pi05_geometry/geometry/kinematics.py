@@ -84,6 +84,15 @@ class Arm:
         if len(set(names)) < len(names):
             raise ValueError(f"Arm '{name}' names a joint twice: {', '.join(names)}.")
 
+    def check_state_names(self, name: str, names: Sequence[str]) -> None:
+        """Raise ValueError, naming the arm, unless the state's entries that it reads have the names it knows them by."""
+        for joint in self.joints:
+            if joint.index >= len(names) or names[joint.index] != joint.state:
+                raise ValueError(
+                    f"By the calibration, joint '{joint.joint}' of arm '{name}' is state entry {joint.index}, '{joint.state}', "
+                    f"but the dataset's state has {', '.join(names)}; run `pi05-geometry calibrate arm` with this dataset."
+                )
+
     def chain(self, link: str) -> list[Link]:
         """Links from the root down to `link`. Raises ValueError if there is no such link."""
         by_name = {each.name: each for each in self.links}

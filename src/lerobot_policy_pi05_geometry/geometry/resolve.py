@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from .calibration import Calibration, Rig, read_calibration_file
 from .da3 import Da3Encoder, Da3Source
 from .da3.weights import load_da3
-from .dataset_calibration import read_dataset_calibration
+from .dataset_calibration import check_state_names, read_dataset_calibration
 from .dataset_depth import check_depth_scale, codec_bounds
 from .depth import LEROBOT_COUNT
 from .feature_store import FeatureStoreSource
@@ -172,6 +172,8 @@ def _calibrated(
     calibration = resolve_calibration(config, dataset_meta)
     rigs = choose_rigs(config, calibration)
     check_calibration(config, rigs, cameras)
+    if dataset_meta is not None:
+        check_state_names(calibration, dataset_meta.features)
     recorded = {
         "calibration": calibration.cameras,
         "arms": calibration.arms,

@@ -9,6 +9,7 @@ from ..checkpoint.load import load_policy
 from ..configuration_pi05_geometry import PI05GeometryConfig
 from ..dataset_folder import require_dataset
 from ..geometry.calibration import Calibration
+from ..geometry.dataset_calibration import check_state_names
 from .page import Page, picture
 from .pictures import depth_figure, layout_figure, segment_share_figure
 from .scene import Scene, log_to_rerun, scene_figure, scene_of
@@ -19,7 +20,8 @@ def write_inspection(
 ) -> None:
     """Write a page about one frame of a dataset, processed by a checkpoint. rerun: a file of the scene for the rerun viewer.
 
-    Raises ValueError for a frame outside the dataset or a checkpoint of another policy.
+    Raises ValueError for a frame outside the dataset, a checkpoint of another policy, and an arm whose joints are other entries
+    of the state.
     """
     require_dataset(root)
     loaded = load_policy(checkpoint, device)
@@ -27,6 +29,9 @@ def write_inspection(
     dataset = LeRobotDataset(repo_id, root=root, depth_output_unit=policy.config.depth_unit)
     if not 0 <= frame < len(dataset):
         raise ValueError(f"The dataset has frames 0 to {len(dataset) - 1}; there is no frame {frame}.")
+    check_state_names(
+        Calibration(policy.config.calibration, policy.config.arms, policy.config.rigs), dataset.meta.features
+    )
     raw = frame_batch(dataset, frame)
     scene = scene_of_policy(policy.config, raw)
     if rerun is not None:

@@ -7,11 +7,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import OBS_IMAGES
 
 from ..dataset_folder import require_dataset
 from ..geometry.calibration import Calibration
 from ..geometry.camera import CameraCalibration, Mount, pose_of_sensor
+from ..geometry.dataset_calibration import state_names
 from ..geometry.depth import LEROBOT_COUNT
 from ..geometry.keys import depth_key
 from ..geometry.kinematics import Arm, ForwardKinematics, Link, StateJoint
@@ -75,14 +76,12 @@ def keep_offsets(made: Arm, before: Arm | None) -> list[str]:
     return [joint.joint for joint in made.joints if joint.offset]
 
 
-def state_names(dataset: LeRobotDataset) -> list[str]:
+def named_state(dataset: LeRobotDataset) -> list[str]:
     """Names of the state's entries. Raises ValueError if the dataset does not say them."""
-    names = dataset.meta.features[OBS_STATE].get("names")
-    if isinstance(names, dict):
-        names = next(iter(names.values()), None)
-    if not isinstance(names, list):
+    names = state_names(dataset.meta.features)
+    if names is None:
         raise ValueError("The dataset does not name the entries of its state; record it with lerobot-record.")
-    return [str(name) for name in names]
+    return names
 
 
 def calibrate_hand_eye(
@@ -109,12 +108,7 @@ def calibrate_hand_eye(
         raise ValueError(f"The calibration has no arm '{arm_name}'; write it first with `pi05-geometry calibrate arm`.")
     arm, of_camera = calibration.arms[arm_name], calibration.cameras[camera]
     dataset = LeRobotDataset(repo_id, root=require_dataset(root))
-    names = state_names(dataset)
-    for joint in arm.joints:
-        if joint.index >= len(names) or names[joint.index] != joint.state:
-            raise ValueError(
-                f"State entry {joint.index} is not '{joint.state}' in this dataset; its state has {', '.join(names)}."
-            )
+    arm.check_state_names(arm_name, named_state(dataset))
     kinematics = ForwardKinematics(arm, [link])
     image_key = f"{OBS_IMAGES}.{camera}"
     views = find_views(dataset, image_key, kinematics, board)

@@ -13,6 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import OBS_STATE
 
 from ..geometry.calibration import Rig
+from ..geometry.dataset_calibration import check_state_names, state_names
 from ..geometry.dataset_depth import codec_bounds
 from ..geometry.depth import to_metres
 from ..geometry.keys import RAW_STATE, find_depth_key, find_depth_keys
@@ -140,6 +141,9 @@ def check_link_depth(dataset: LeRobotDataset, rig: Rig, camera: str, arm_name: s
         known = ", ".join([*rig.cameras, *rig.arms]) or "nothing"
         raise ValueError(f"The calibration has no camera '{camera}' or no arm '{arm_name}'; it has {known}.")
     features = dataset.meta.features
+    check_state_names(rig, features)
+    if (names := state_names(features)) is not None:
+        rig.arms[arm_name].check_state_names(arm_name, names)
     depth_keys = find_depth_keys(features, {})
     key = find_depth_key(camera, features, depth_keys)
     if key is None:
