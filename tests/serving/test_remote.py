@@ -194,6 +194,56 @@ def test_a_late_chunk_is_never_used():
         assert len(engine.batches) >= 3
 
 
+def test_a_reset_while_another_thread_waits_for_a_chunk_begins_an_episode():
+    """LeRobot's real-time chunking asks in a thread, and resets in another one."""
+    engine, found = FakeEngine(), []
+    with serving(fake_like_real(engine)) as running:
+        policy = remote(running.url, rtc_config=RTCConfig())
+        engine.release.clear()
+        thread = threading.Thread(target=lambda: found.append(policy.predict_action_chunk(exact())))
+        thread.start()
+        while not engine.batches:
+            time.sleep(0.01)
+        policy.reset()
+        engine.release.set()
+        thread.join(30)
+        left_over = found[0][0, 2:]
+        observation = exact() | {STATE: torch.full((1, STATE_DIM), 0.25)}
+        chunk = policy.predict_action_chunk(observation, inference_delay=0, prev_chunk_left_over=left_over)
+        assert (chunk == 0.25).all()
+        job = engine.batches[-1][0]
+        assert job.begins
+        assert job.request.guidance is None  # the last episode's chunk is not continued
+        policy.predict_action_chunk(exact())
+        assert not engine.batches[-1][0].begins
+
+
+class FakeClient:
+    """answers: what the server answers, one after the other."""
+
+    def __init__(self, *answers: dict):
+        self.answers, self.closed = list(answers), False
+
+    def send(self, request: dict) -> None:
+        pass
+
+    def receive(self) -> dict:
+        return self.answers.pop(0)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_an_answer_without_actions_ends_the_session():
+    """What came after it would be taken for another request's answer."""
+    client = FakeClient({"reset": True}, {"actions": np.zeros((2, 3), np.float32)})
+    session = RobotSession(lambda: client, 0)
+    session.begin({})
+    with pytest.raises(ServerLostError, match="answered a request without actions"):
+        session.finish()
+    assert client.closed
+
+
 def test_a_refusal_is_the_servers_sentence_and_leaves_the_other_rows_in_order():
     engine = FakeEngine()
     with serving(fake_like_real(engine)) as running:

@@ -97,7 +97,7 @@ class PI05GeometryRemotePolicy(PreTrainedPolicy):
         }
 
     def reset(self) -> None:
-        """Start of an episode: forget the queued actions, and tell the server."""
+        """Start of an episode: forget the queued actions, and tell the server with the next request."""
         self._action_queue: deque[Tensor] = deque(maxlen=self._action_steps)
         for session in self._sessions:
             session.reset()

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,13 +18,18 @@ _PAUSE = 0.2  # seconds between two attempts to connect
 
 
 class RobotSession:
-    """connect: opens a session. reconnect: seconds to try for."""
+    """connect: opens a session. reconnect: seconds to try for.
+
+    One thread at a time asks for chunks, and only it uses the connection. `reset` may be called by another thread meanwhile, as
+    LeRobot does.
+    """
 
     def __init__(self, connect: Callable[[], PolicyClient], reconnect: float) -> None:
         self._connect, self._reconnect = connect, reconnect
         self._client: PolicyClient | None = None
         self._last: Tensor | None = None  # the last chunk (S, A), as it was returned
-        self._request: dict[str, Any] = {}
+        self._request: dict[str, Any] = {}  # the last one
+        self._reset_due = False
 
     @property
     def client(self) -> PolicyClient:
@@ -41,18 +47,17 @@ class RobotSession:
         return self._client
 
     def reset(self) -> None:
-        """A new episode; if the server is lost, the next connection is one."""
-        self._last = None
-        if self._client is not None:
-            try:
-                self._client.reset()
-            except ServerLostError as error:
-                self._lose(error)
+        """A new episode, of which the server is told before it is asked for the next chunk."""
+        self._reset_due = bool(self._request)  # before its first request a session is new
 
     def begin(self, request: dict[str, Any]) -> None:
         """Send a request, whose chunk `finish` returns."""
         self._request = request
         try:
+            if self._reset_due:
+                self._reset_due, self._last = False, None
+                if self._client is not None:  # a new connection is a new episode
+                    self._client.reset()
             self.client.send(request)
         except ServerLostError as error:
             self._lose(error)
@@ -61,7 +66,7 @@ class RobotSession:
         """The chunk (S, A) float32 of the request that was begun.
 
         If the server was lost meanwhile, it is asked once more in a new session, with no chunk to continue. Raises
-        ServerLostError if it is lost again, RefusedError with its sentence.
+        ServerLostError if it is lost again or answers without a chunk, RefusedError with its sentence.
         """
         answer = None
         if self._client is not None:
@@ -71,7 +76,11 @@ class RobotSession:
                 self._lose(error)
         if answer is None:
             answer = self.client.infer({k: v for k, v in self._request.items() if k not in GUIDANCE_KEYS})
-        self._last = torch.from_numpy(answer["actions"].copy())
+        actions = answer.get("actions")
+        if not isinstance(actions, np.ndarray):
+            self.abandon()
+            raise ServerLostError("The server answered a request without actions, so the session was ended.")
+        self._last = torch.from_numpy(actions.copy())
         return self._last
 
     def executed(self, left_over: Tensor) -> int | None:
@@ -80,7 +89,7 @@ class RobotSession:
         None if it is no part of the last chunk, as after a lost connection. Where several positions fit, the actions there
         are equal, and the first is as good as any.
         """
-        if self._last is None:
+        if self._last is None or self._reset_due:
             return None
         for start in range(len(self._last)):
             rest = self._last[start : start + len(left_over)]
