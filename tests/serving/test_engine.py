@@ -9,6 +9,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.policies.rtc.modeling_rtc import RTCProcessor
+from lerobot.processor import RenameObservationsProcessorStep
 
 from lerobot_policy_pi05_geometry import compat
 from lerobot_policy_pi05_geometry.inference.cuda_graphs import GraphRunner
@@ -17,8 +18,19 @@ from lerobot_policy_pi05_geometry.serving.engine import Job, PolicyEngine, make_
 from lerobot_policy_pi05_geometry.serving.inputs import Inputs
 from lerobot_policy_pi05_geometry.serving.limits import Limits, RequestError
 from lerobot_policy_pi05_geometry.serving.noise import request_noise
+from lerobot_policy_pi05_geometry.serving.service import make_service
 from lerobot_policy_pi05_geometry.serving.session import Session
-from tests.entry_points import ACTION_DIM, CHUNK, WRIST_DEPTH, WRIST_POSE, make_calibration, make_features, without
+from tests.entry_points import (
+    ACTION_DIM,
+    CHUNK,
+    FRONT,
+    WRIST,
+    WRIST_DEPTH,
+    WRIST_POSE,
+    make_calibration,
+    make_features,
+    without,
+)
 from tests.inference.tape import TapeBackend
 
 from .running import load, local_chunk, make_request, observation_of
@@ -64,6 +76,18 @@ def test_in_a_batch_it_is_the_local_chunk_to_rounding(size, dtype, far):
         _, actions = local_chunk(loaded, [request], job.noise[None])
         np.testing.assert_allclose(answer.actions, actions[0].numpy(), atol=far, rtol=0)
     assert np.abs(answers[0].actions - answers[1].actions).max() > 0.1
+
+
+def test_cameras_that_training_swapped_are_not_swapped_again():
+    """A request is read under the policy's names; the preprocessor would take them for the data's."""
+    loaded, request = load(), make_request()
+    expected = PolicyEngine(loaded).run(jobs_of(loaded, [request]), 1)[0].chunk
+    step = next(s for s in loaded.preprocess.steps if isinstance(s, RenameObservationsProcessorStep))
+    step.rename_map = {FRONT: WRIST, WRIST: FRONT}
+    service = make_service(loaded, (1,))
+    job = make_job(Session(name="robot 0"), service.inputs.read(request), 7, SHAPE)
+    assert torch.equal(service.engine.run([job], 1)[0].chunk, expected)
+    assert step in loaded.preprocess.steps
 
 
 def test_noise_follows_session_and_request():

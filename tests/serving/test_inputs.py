@@ -61,6 +61,18 @@ def test_names_of_the_data_that_the_preprocessor_renames():
     assert FRONT in inputs.read(request).observation
 
 
+TOP = "observation.images.top"
+
+
+@pytest.mark.parametrize("rename_map", [{FRONT: WRIST, WRIST: FRONT}, {TOP: FRONT, FRONT: WRIST}])
+@pytest.mark.parametrize("spelled", [dict, flat, slashed])
+def test_the_policys_names_mean_its_cameras_whatever_its_data_called_them(rename_map, spelled):
+    request = make_request()
+    found = make_inputs(rename_map).read(spelled(request)).observation
+    for camera, key in (("front", FRONT), ("wrist", WRIST)):
+        np.testing.assert_array_equal(found[key], request["images"][camera])
+
+
 def change(request: dict, *path: str, value) -> dict:
     name, *rest = path
     return request | {name: change(request[name], *rest, value=value) if rest else value}

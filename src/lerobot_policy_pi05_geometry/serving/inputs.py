@@ -80,9 +80,10 @@ class Request(NamedTuple):
 
 
 class Inputs:
-    """What requests to a policy may hold. rename_map: names of the data -> names of the policy, as its preprocessor has it.
+    """What requests to a policy may hold: under the policy's names, and under those of its training data that are none of these.
 
-    rig: the one that is served, of a checkpoint that has several.
+    rename_map: names of the data -> names of the policy, as its preprocessor has it. rig: the one that is served, of a checkpoint
+    that has several.
     """
 
     def __init__(
@@ -98,10 +99,9 @@ class Inputs:
         self._chunk_size = config.chunk_size
         self.expected = {entry.key: entry for entry in _expected(config)}
         self.trained_size = {key: tuple(feature.shape[-2:]) for key, feature in config.image_features.items()}
-        self._names: dict[str, str] = {}
-        for key in self.expected:
-            raw = [name for name, renamed in (rename_map or {}).items() if renamed == key]
-            self._names.update(dict.fromkeys((*_spellings(key), *raw), key))
+        renamed = {name: key for name, key in (rename_map or {}).items() if key in self.expected}
+        # The policy's names, which the metadata lists, come first: with cameras swapped, the data's mean another camera.
+        self._names = renamed | {name: key for key in self.expected for name in _spellings(key)}
 
     def read(self, message: Mapping[str, Any], seen: Iterable[str] = (), rig: int | None = None) -> Request:
         """The request in a message. seen: keys that may be missing now, since the session has sent them before: a camera fails.

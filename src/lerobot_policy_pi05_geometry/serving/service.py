@@ -15,6 +15,7 @@ from .inputs import Inputs
 from .keys import read_key, require_safe
 from .limits import Limits
 from .metadata import describe
+from .renaming import without_renaming
 from .websocket_server import WebsocketServer
 from .worker import BatchWorker
 
@@ -38,7 +39,7 @@ def make_service(
     Raises ValueError for a rig that the checkpoint does not have.
     """
     limits = limits or Limits()
-    engine = PolicyEngine(loaded)
+    engine = PolicyEngine(without_renaming(loaded))
     steps = getattr(loaded.preprocess, "steps", ())
     rename = next((s.rename_map for s in steps if isinstance(s, RenameObservationsProcessorStep)), None)
     inputs = Inputs(engine.config, limits, rename, rig)
