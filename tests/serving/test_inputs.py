@@ -138,6 +138,20 @@ def test_what_is_wrong_is_named_in_one_sentence(name):
     assert "\n" not in str(caught.value)
 
 
+def test_float_images_may_overshoot_as_far_as_the_local_policy_takes_them():
+    """Cubic interpolation gives 1.005."""
+    inputs, request = make_inputs(), make_request()
+    front = request["images"]["front"].astype(np.float32) / 255
+    for value, refused in ((1.005, False), (-0.005, False), (1.05, True), (-0.05, True)):
+        front[0, 0, 0] = value
+        changed = change(request, "images", "front", value=front)
+        if refused:
+            with pytest.raises(RequestError, match="outside 0 to 1"):
+                inputs.read(changed)
+        else:
+            np.testing.assert_array_equal(inputs.read(changed).observation[FRONT], front)
+
+
 def test_a_depth_camera_may_fail_once_it_has_been_seen():
     inputs, request = make_inputs(), without(make_request(), "depth", "extrinsics")
     request["depth"] = {"front": depth}

@@ -17,6 +17,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot_policy_pi05_geometry import PI05GeometryRemoteConfig
 from lerobot_policy_pi05_geometry.checkpoint.load import load_policy
 from lerobot_policy_pi05_geometry.serving.client import RefusedError, ServerLostError
+from lerobot_policy_pi05_geometry.serving.limits import RequestError
 from lerobot_policy_pi05_geometry.serving.remote.robot_session import RobotSession, chunks_of
 from lerobot_policy_pi05_geometry.serving.remote.rows import requests_of
 from tests.entry_points import (
@@ -34,6 +35,7 @@ from tests.entry_points import (
 
 from .processes import logged, run, run_here, server_process
 from .running import FakeEngine, fake_server, load, real_server, serving
+from .test_inputs import make_inputs
 
 
 def remote(url: str, **settings):
@@ -121,6 +123,28 @@ def test_what_is_sent_is_small_and_loses_nothing():
     holes = observation[WRIST_DEPTH].clone()
     holes[0, 0, 0, 0] = float("nan")
     assert requests_of(observation | {WRIST_DEPTH: holes}, inputs)[0][WRIST_DEPTH].dtype == np.float32
+
+
+def test_images_of_another_scale_arrive_as_they_are_and_the_server_refuses_them():
+    """Floats from 0 to 255 would be wrapped into another picture."""
+    inputs = make_inputs()
+    sent = requests_of(exact() | {FRONT: (exact()[FRONT] * 255).round()}, {key: {} for key in inputs.expected})[0]
+    assert sent[FRONT].dtype == np.float32
+    with pytest.raises(RequestError, match="outside 0 to 1"):
+        inputs.read(sent)
+
+
+def test_depth_of_8_bits_is_refused_as_it_is_locally():
+    observation = exact() | {WRIST_DEPTH: torch.zeros(1, 1, 12, 12, dtype=torch.uint8)}
+    with pytest.raises(ValueError, match=r"wrist_depth has dtype torch\.uint8, but depth must be uint16 or float"):
+        requests_of(observation, {WRIST_DEPTH: {}, STATE: {}})
+
+
+def test_one_task_is_every_rows():
+    for task in ("pick", ["pick"], ("pick",)):
+        assert [request["task"] for request in requests_of(exact(3) | {"task": task}, {STATE: {}})] == ["pick"] * 3
+    with pytest.raises(ValueError, match="has 3 rows but 2 tasks; give one task, or one for each"):
+        requests_of(exact(3) | {"task": ["a", "b"]}, {STATE: {}})
 
 
 def test_real_time_chunking_asks_to_continue_where_the_robot_is():

@@ -12,7 +12,7 @@ from ..geometry.images import rgb_image
 if TYPE_CHECKING:
     from ..configuration_pi05_geometry import PI05GeometryConfig
 
-_TOLERANCE = 0.02  # what resizing with cubic interpolation or a video codec may overshoot
+RANGE_TOLERANCE = 0.02  # what resizing with cubic interpolation or a video codec may overshoot
 
 
 def prepare_images(
@@ -66,7 +66,7 @@ class ImageRangeCheck:
 
 def _require_unit_range(image: Tensor, key: str) -> None:
     low, high = (bound.item() for bound in image.aminmax())
-    if low >= -_TOLERANCE and high <= 1 + _TOLERANCE:  # false for NaN
+    if low >= -RANGE_TOLERANCE and high <= 1 + RANGE_TOLERANCE:  # false for NaN
         return
     hint = " (was it scaled to 0..255?)" if high > 2 else " (was it scaled to [-1, 1]?)" if low < 0 else ""
     raise ValueError(f"{key} has values from {low:g} to {high:g}{hint}; give images as uint8, or as floats in [0, 1].")

@@ -47,11 +47,7 @@ def to_metres(
 
     Raises ValueError for a dtype that no depth camera gives or a wrong size.
     """
-    if depth.dtype not in _DTYPES:
-        raise ValueError(
-            f"{key} has dtype {depth.dtype}, but depth must be uint16 or float in the declared unit ({unit}); an "
-            "8-bit depth image has lost its distances, so record the camera's raw depth."
-        )
+    check_dtype(depth, key)
     if depth.ndim == 3:
         depth = depth[:, None]
     elif depth.ndim == 4 and depth.shape[1] != 1 and depth.shape[-1] == 1:
@@ -66,6 +62,15 @@ def to_metres(
     # Comparisons with NaN are False.
     valid = (metres > MIN_DEPTH) & (metres < max_depth) & within(declared, bounds) & ~is_largest_value(depth, unit)
     return metres.masked_fill(~valid, 0.0), valid
+
+
+def check_dtype(depth: Tensor, key: str) -> None:
+    """Raise ValueError for a dtype that no depth camera gives."""
+    if depth.dtype not in _DTYPES:
+        raise ValueError(
+            f"{key} has dtype {depth.dtype}, but depth must be uint16 or float in the declared unit (--policy.depth_unit); an "
+            "8-bit depth image has lost its distances, so record the camera's raw depth."
+        )
 
 
 def within(declared: Tensor, bounds: tuple[float, float]) -> Tensor:

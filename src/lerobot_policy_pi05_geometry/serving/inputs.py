@@ -21,6 +21,7 @@ from lerobot.configs import RTCAttentionSchedule
 from lerobot.utils.constants import OBS_STATE
 
 from ..configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
+from ..data.images import RANGE_TOLERANCE
 from ..geometry.camera import CameraCalibration
 from ..geometry.keys import CALIBRATION_PREFIX, DEPTH_SUFFIX, IMAGE_PREFIX, depth_key, extrinsics_key, is_geometry_key
 from .limits import Limits, RequestError, shown
@@ -174,7 +175,7 @@ class Inputs:
             value = value.astype(np.float32)
             if not np.isfinite(value).all():
                 raise RequestError(f"{name} holds a number that is not finite.")
-            if entry.shape == _IMAGE and (value.min() < 0 or value.max() > 1):
+            if entry.shape == _IMAGE and not -RANGE_TOLERANCE <= value.min() <= value.max() <= 1 + RANGE_TOLERANCE:
                 raise RequestError(f"{name} is a float image with values outside 0 to 1; send those, or uint8.")
         return value
 

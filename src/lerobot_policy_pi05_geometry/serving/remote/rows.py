@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...geometry.depth import check_dtype
 from ...geometry.keys import CALIBRATION_PREFIX, is_geometry_key
 from ...geometry.point_map import as_pose
 
@@ -15,14 +16,18 @@ def requests_of(batch: Mapping[str, Any], inputs: Mapping[str, Mapping[str, Any]
     """Requests with what the server expects of this batch.
 
     batch: images (B, 3, H, W) or (B, H, W, 3), depth (B, 1, H, W), (B, H, W, 1) or (B, H, W), poses (B, 4, 4) or (4, 4), or as
-    16 numbers, the rest (B, D), and `task`. inputs: of the server's metadata; what it does not name stays here.
+    16 numbers, the rest (B, D), and `task`, one for all rows or one for each. inputs: of the server's metadata; what it does not
+    name stays here. Raises ValueError for nothing that is expected, another number of tasks, and depth that is no distance.
     """
     tensors = {key: batch[key].detach().cpu() for key in inputs if isinstance(batch.get(key), Tensor)}
     if not tensors:
         raise ValueError(f"The observation has nothing of what the server expects: {', '.join(inputs)}.")
     size = next(t.shape[0] for key, t in tensors.items() if not key.startswith(CALIBRATION_PREFIX))
     tasks = batch.get("task") or ""
-    tasks = [tasks] * size if isinstance(tasks, str) else list(tasks)
+    tasks = [tasks] if isinstance(tasks, str) else list(tasks)
+    tasks = tasks * size if len(tasks) == 1 else tasks
+    if len(tasks) != size:
+        raise ValueError(f"The batch has {size} rows but {len(tasks)} tasks; give one task, or one for each.")
     arrays = {key: _packed(key, tensor, size) for key, tensor in tensors.items()}
     return [{**{key: array[row] for key, array in arrays.items()}, "task": tasks[row]} for row in range(size)]
 
@@ -32,6 +37,7 @@ def _packed(key: str, tensor: Tensor, size: int) -> np.ndarray:
     if key.startswith(CALIBRATION_PREFIX):
         return as_pose(tensor.float(), key).expand(size, 4, 4).contiguous().numpy()
     if is_geometry_key(key):
+        check_dtype(tensor, key)
         return _packed_depth(tensor)
     if tensor.ndim == 4:
         return _packed_images(tensor)
@@ -45,7 +51,8 @@ def _packed_images(images: Tensor) -> np.ndarray:
     if images.dtype != torch.uint8:
         images = images.float()
         whole = (images * 255).round()
-        images = whole.to(torch.uint8) if torch.equal(whole / 255, images) else images
+        exact = torch.equal(whole / 255, images) and whole.min() >= 0 and whole.max() <= 255  # beyond, uint8 would wrap
+        images = whole.to(torch.uint8) if exact else images
     return images.contiguous().numpy()
 
 
