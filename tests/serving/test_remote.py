@@ -204,6 +204,24 @@ def test_a_lost_server_is_reached_again_as_a_new_episode():
         assert engine.batches[-1][0].begins
 
 
+def test_a_server_that_comes_back_with_another_policy_is_an_error():
+    """Its chunks would be of another length, its depth of another unit."""
+    engine = FakeEngine()
+    first, second = fake_like_real(engine), fake_like_real(engine)
+    second._metadata = copy.deepcopy(first._metadata) | {"depth_unit": "m", "action_names": ["a"]}
+    second._metadata["inputs"][STATE]["shape"] = [9]
+    with serving(first) as running:
+        policy = remote(running.url)
+        policy.predict_action_chunk(exact())
+    with serving(second) as running:
+        policy.config.server = running.url
+        said = r"\(action_names: None before, \['a'\] now, inputs: observation\.state, depth_unit: mm before, m now\)"
+        for rows in (1, 2):
+            with pytest.raises(ValueError, match=said):
+                policy.predict_action_chunk(exact(rows))
+    assert len(engine.batches) == 1
+
+
 def test_a_late_chunk_is_never_used():
     engine = FakeEngine()
     with serving(fake_like_real(engine)) as running:

@@ -26,7 +26,7 @@ from ..client import PolicyClient  # noqa: E402
 from ..keys import read_key  # noqa: E402
 from ..limits import PROTOCOL  # noqa: E402
 from .configuration_pi05_geometry_remote import NO_TRAINING, PI05GeometryRemoteConfig  # noqa: E402
-from .robot_session import RobotSession, chunks_of  # noqa: E402
+from .robot_session import RobotSession, chunks_of, require_same_policy  # noqa: E402
 from .rows import requests_of  # noqa: E402
 
 
@@ -43,7 +43,8 @@ class PI05GeometryRemotePolicy(PreTrainedPolicy):
         if not config.server:
             raise ValueError("The remote policy needs a server: give --policy.server=ws://<host>:8000.")
         self._key = read_key(None if config.key_file is None else Path(config.key_file))
-        self._sessions = [self._new_session()]
+        self._metadata: dict[str, Any] = {}
+        self._sessions = [RobotSession(self._connect, config.reconnect)]
         self._metadata = self._sessions[0].client.metadata
         self._complete()
         self.reset()
@@ -58,9 +59,16 @@ class PI05GeometryRemotePolicy(PreTrainedPolicy):
         assert isinstance(config, PI05GeometryRemoteConfig)
         return cls(config).eval()
 
-    def _new_session(self) -> RobotSession:
-        config = self.config
-        return RobotSession(lambda: PolicyClient(config.server, self._key, config.timeout), config.reconnect)
+    def _connect(self) -> PolicyClient:
+        """A new session. Raises ServerLostError, and ValueError if the server has another policy than the first one had."""
+        client = PolicyClient(self.config.server, self._key, self.config.timeout)
+        if self._metadata:
+            try:
+                require_same_policy(self._metadata, client.metadata)
+            except ValueError:
+                client.close()
+                raise
+        return client
 
     def _complete(self) -> None:
         """Features and sizes as the server's checkpoint has them."""
@@ -119,11 +127,12 @@ class PI05GeometryRemotePolicy(PreTrainedPolicy):
         """An action chunk (B, chunk_size, action_dim) float32, in the robot's units.
 
         kwargs: `noise` (B, S, max_action_dim), and real-time chunking's `inference_delay`, `prev_chunk_left_over` (T, A) or
-        (B, T, A) and `execution_horizon`. Raises ServerLostError, and RefusedError with the server's sentence.
+        (B, T, A) and `execution_horizon`. Raises ServerLostError, RefusedError with the server's sentence,
+        and ValueError if a server that was lost came back with another policy.
         """
         requests = requests_of(batch, self._metadata["inputs"])
         while len(self._sessions) < len(requests):
-            self._sessions.append(self._new_session())
+            self._sessions.append(RobotSession(self._connect, self.config.reconnect))
         sessions = self._sessions[: len(requests)]
         noise = kwargs.get("noise")
         if noise is None and self.config.noise == "client":

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -109,6 +109,25 @@ class RobotSession:
     def _lose(self, error: ServerLostError) -> None:
         logger.warning("%s A new session begins.", error)
         self.abandon()
+
+
+def require_same_policy(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise ValueError unless two metadata describe one policy. They name their sessions, which differ."""
+    changed = [key for key in {**before, **now} if key != "session" and before.get(key) != now.get(key)]
+    if changed:
+        told = ", ".join(_change(key, before, now) for key in changed)
+        raise ValueError(
+            f"The server has another policy than when this robot began ({told}); start the robot's "
+            "program again, if that is the one to use."
+        )
+
+
+def _change(key: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """What of an entry differs: keys of maps, else values."""
+    old, new = before.get(key), now.get(key)
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        return f"{key}: {', '.join(name for name in {**old, **new} if old.get(name) != new.get(name))}"
+    return f"{key}: {old} before, {new} now"
 
 
 def chunks_of(sessions: Sequence[RobotSession], requests: Sequence[dict[str, Any]]) -> list[Tensor]:
