@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from lerobot_policy_pi05_geometry.geometry.calibration import Calibration, read_calibration_file, write_calibration_file
 from lerobot_policy_pi05_geometry.geometry.camera import CameraCalibration, ColorStream, Mount, pose_of_sensor
-from lerobot_policy_pi05_geometry.geometry.kinematics import Arm, ForwardKinematics
+from lerobot_policy_pi05_geometry.geometry.kinematics import Arm, ForwardKinematics, Link
 from lerobot_policy_pi05_geometry.robot import realsense
 from lerobot_policy_pi05_geometry.robot.board import Board
 from lerobot_policy_pi05_geometry.robot.calibrate import check_board_depth, image_stream, keep_offsets, make_arm
@@ -65,6 +65,59 @@ def test_unusable_link_files_are_refused(old, new, said, tmp_path):
     (tmp_path / "arm.urdf").write_text(URDF.replace(old, new))
     with pytest.raises(ValueError, match=said):
         read_links(tmp_path / "arm.urdf")
+
+
+def urdf_of(*joints: tuple[str, str, str, str, str]) -> str:
+    """joints: name, type, what it mimics as XML, parent and child link."""
+    links = "".join(f'<link name="{name}"/>' for name in ("base", *(child for *_, child in joints)))
+    return f"<robot>{links}" + "".join(
+        f'<joint name="{name}" type="{kind}">{mimic}<parent link="{parent}"/><child link="{child}"/><axis xyz="0 0 1"/></joint>'
+        for name, kind, mimic, parent, child in joints
+    ) + "</robot>"  # fmt: skip
+
+
+JAW = ("jaw", "prismatic", '<mimic joint="motor" multiplier="0.01"/>', "base", "jaw")
+MOTOR = ("motor", "revolute", "", "base", "pinion")
+OTHER_JAW = ("other", "prismatic", '<mimic joint="jaw" multiplier="-2" offset="0.001"/>', "base", "other_jaw")
+
+
+@pytest.mark.parametrize("order", [(MOTOR, JAW, OTHER_JAW), (JAW, MOTOR, OTHER_JAW), (JAW, OTHER_JAW, MOTOR)])
+def test_jaws_slide_with_a_motor_that_turns_whatever_the_order_of_links(order, tmp_path):
+    """The second jaw mimics the first, which mimics the motor: 90 degrees are 1.57 radians."""
+    (tmp_path / "arm.urdf").write_text(urdf_of(*order))
+    arm = make_arm(read_links(tmp_path / "arm.urdf"), ["motor.pos"])
+    assert [(joint.joint, joint.unit) for joint in arm.joints] == [("motor", "degrees")]
+    found = ForwardKinematics(arm, ["jaw", "other_jaw"])(torch.tensor([[90.0]]).double())[0, :, 2, 3]
+    moved = 0.01 * np.pi / 2
+    np.testing.assert_allclose(found, [moved, -2 * moved + 0.001], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("mimic", "said"),
+    [
+        ("other", "'jaw' in .* mimics itself"),
+        ("held", "'held', which is of type 'fixed'"),
+        ("x", "'x', which is not there"),
+    ],
+)
+def test_a_joint_that_mimics_what_never_moves_is_refused(mimic, said, tmp_path):
+    jaw = ("jaw", "prismatic", f'<mimic joint="{mimic}"/>', "base", "jaw")
+    (tmp_path / "arm.urdf").write_text(urdf_of(jaw, OTHER_JAW, ("held", "fixed", "", "base", "hand")))
+    with pytest.raises(ValueError, match=said):
+        read_links(tmp_path / "arm.urdf")
+
+
+def test_an_arm_whose_links_contradict_each_other_about_a_joint_is_refused():
+    """As files have it that were written before a link knew the kind of the joint that it mimics."""
+    links = [
+        Link("base"),
+        Link("a", "base", kind="prismatic", joint="j"),
+        Link("b", "base", kind="revolute", joint="j"),
+    ]
+    with pytest.raises(
+        ValueError, match=r"Arm 'arm': joint 'j' is prismatic for one link and revolute for link 'b'.*calibrate arm"
+    ):
+        Arm(links, []).check("arm")
 
 
 def test_joints_are_found_by_their_names():

@@ -27,7 +27,8 @@ class Link:
     parent: name of the parent link, "" for the root. origin: `parent_T_link` (4 rows of 4, metres) at joint value 0. kind:
     "fixed", "revolute" or "prismatic". joint: name of the joint, "" if fixed. axis: of the joint, in the link's own frame,
     of length 1. scale, shift: the joint moves by scale * value + shift, radians or metres (a joint that mimics another has
-    that one's name and its own scale; MJCF's reference position is a shift).
+    that one's name and its own scale; MJCF's reference position is a shift). joint_kind: of the joint that is named, "" where it
+    is `kind`; a jaw may slide with a motor that turns.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Link:
     axis: list[float] = field(default_factory=lambda: [0.0, 0.0, 1.0])
     scale: float = 1.0
     shift: float = 0.0
+    joint_kind: str = ""
 
 
 @dataclass
@@ -77,7 +79,10 @@ class Arm:
             known[link.name] = link
         if not known:
             raise ValueError(f"Arm '{name}' has no links; write it with `pi05-geometry calibrate arm`.")
-        kinds = {link.joint: link.kind for link in self.links if link.joint}
+        try:
+            kinds = joint_kinds(self.links)
+        except ValueError as error:
+            raise ValueError(f"Arm '{name}': {error}") from error
         for joint in self.joints:
             _check_state_joint(joint, kinds, name)
         names = [joint.joint for joint in self.joints]
@@ -104,6 +109,22 @@ class Arm:
         return path[::-1]
 
 
+def joint_kinds(links: Sequence[Link]) -> dict[str, str]:
+    """Joint -> whether it is "revolute" or "prismatic" itself, in the order of the links.
+
+    Raises ValueError where links say different things of one joint.
+    """
+    kinds: dict[str, str] = {}
+    for link in links:
+        kind = link.joint_kind or link.kind
+        if link.joint and kinds.setdefault(link.joint, kind) != kind:
+            raise ValueError(
+                f"joint '{link.joint}' is {kinds[link.joint]} for one link and {kind} for link '{link.name}'; write "
+                "the arm again with `pi05-geometry calibrate arm`."
+            )
+    return kinds
+
+
 def _check_link(link: Link, known: dict[str, Link], arm: str) -> None:
     where = f"Link '{link.name}' of arm '{arm}'"
     if not link.name or link.name in known:
@@ -115,6 +136,8 @@ def _check_link(link: Link, known: dict[str, Link], arm: str) -> None:
     as_matrix(link.origin, f"{where}: its origin")
     if link.kind not in JOINT_KINDS or (link.kind == "fixed") != (link.joint == ""):
         raise ValueError(f"{where}: kind must be one of {', '.join(JOINT_KINDS)}, and all but fixed need a joint.")
+    if link.joint_kind and (link.joint_kind not in ("revolute", "prismatic") or not link.joint):
+        raise ValueError(f"{where}: joint_kind must be revolute or prismatic, and only a link with a joint has it.")
     numbers = [*link.axis, link.scale, link.shift]
     if len(link.axis) != 3 or not all(math.isfinite(value) for value in numbers):
         raise ValueError(f"{where}: axis must be three finite numbers, scale and shift finite.")

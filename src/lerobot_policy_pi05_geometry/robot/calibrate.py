@@ -15,7 +15,7 @@ from ..geometry.camera import CameraCalibration, Mount, pose_of_sensor
 from ..geometry.dataset_calibration import state_names
 from ..geometry.depth import LEROBOT_COUNT
 from ..geometry.keys import depth_key
-from ..geometry.kinematics import Arm, ForwardKinematics, Link, StateJoint
+from ..geometry.kinematics import Arm, ForwardKinematics, Link, StateJoint, joint_kinds
 from .board import Board, board_pose
 from .dataset_views import find_views
 from .hand_eye import HandEye, solve_hand_eye
@@ -42,13 +42,11 @@ def make_arm(links: list[Link], names: list[str], given: dict[str, str] | None =
     if unknown:
         raise ValueError(f"The state has no entry {', '.join(unknown)}; it has {', '.join(names)}.")
     joints: list[StateJoint] = []
-    for link in links:
-        if not link.joint or link.joint in [joint.joint for joint in joints]:
-            continue
-        entry = given.get(link.joint) or next((n for n in (f"{link.joint}.pos", link.joint) if n in names), None)
+    for joint, kind in joint_kinds(links).items():
+        entry = given.get(joint) or next((n for n in (f"{joint}.pos", joint) if n in names), None)
         if entry is not None:
-            metres = link.kind == "prismatic" and unit in ("degrees", "radians")
-            joints.append(StateJoint(link.joint, entry, names.index(entry), "metres" if metres else unit))
+            metres = kind == "prismatic" and unit in ("degrees", "radians")
+            joints.append(StateJoint(joint, entry, names.index(entry), "metres" if metres else unit))
     if not joints:
         raise ValueError(
             f"No joint of the link file has the name of a state entry ({', '.join(names)}); say which is which with "

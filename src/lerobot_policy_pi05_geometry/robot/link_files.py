@@ -42,6 +42,7 @@ def read_links(path: str | Path, base: str | None = None) -> list[Link]:
 def _read_urdf(robot: ET.Element, path: Path) -> list[Link]:
     """Links of a URDF; those of several roots are all there, each root without a parent."""
     joints = robot.findall("joint")
+    by_name = {joint.get("name", ""): joint for joint in joints}
     children = {}
     for joint in joints:
         child, parent = joint.find("child"), joint.find("parent")
@@ -56,13 +57,13 @@ def _read_urdf(robot: ET.Element, path: Path) -> list[Link]:
         if not ready:
             raise ValueError(f"Links {', '.join(pending)} in {path} hang on each other in a circle, or on no link.")
         for name in ready:
-            links.append(_urdf_link(name, *children[name], joints, path) if name in children else Link(name))
+            links.append(_urdf_link(name, *children[name], by_name, path) if name in children else Link(name))
         placed.update(ready)
         pending = [name for name in pending if name not in placed]
     return links
 
 
-def _urdf_link(name: str, parent: str, joint: ET.Element, joints: list[ET.Element], path: Path) -> Link:
+def _urdf_link(name: str, parent: str, joint: ET.Element, joints: dict[str, ET.Element], path: Path) -> Link:
     kind = _URDF_KINDS.get(joint.get("type", ""))
     told = f"Joint '{joint.get('name')}' in {path}"
     if kind is None:
@@ -80,14 +81,20 @@ def _urdf_link(name: str, parent: str, joint: ET.Element, joints: list[ET.Elemen
         return link
     axis = joint.find("axis")
     link.axis = _unit(_numbers("1 0 0" if axis is None else axis.get("xyz", "1 0 0"), 3, told), told)
-    link.joint = joint.get("name", "")
-    mimic = joint.find("mimic")
-    if mimic is not None:
+    link.joint, passed = joint.get("name", ""), []
+    while (mimic := joint.find("mimic")) is not None:  # a joint may mimic one that mimics another
+        passed.append(link.joint)
         link.joint = mimic.get("joint", "")
-        link.scale = _numbers(mimic.get("multiplier", "1"), 1, told)[0]
-        link.shift = _numbers(mimic.get("offset", "0"), 1, told)[0]
-        if link.joint not in [other.get("name") for other in joints]:
-            raise ValueError(f"{told} mimics '{link.joint}', which is not there.")
+        if link.joint not in joints or link.joint in passed:
+            reason = "itself" if link.joint in passed else f"'{link.joint}', which is not there"
+            raise ValueError(f"{told} mimics {reason}.")
+        link.shift += link.scale * _numbers(mimic.get("offset", "0"), 1, told)[0]
+        link.scale *= _numbers(mimic.get("multiplier", "1"), 1, told)[0]
+        joint = joints[link.joint]
+    driver = _URDF_KINDS.get(joint.get("type", ""))
+    if driver not in ("revolute", "prismatic"):
+        raise ValueError(f"{told} mimics '{link.joint}', which is of type '{joint.get('type')}' and has no value.")
+    link.joint_kind = "" if driver == kind else driver
     return link
 
 
