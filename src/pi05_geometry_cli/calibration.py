@@ -109,7 +109,12 @@ def arm(
         list[str] | None, typer.Option(help="JOINT=STATE_ENTRY, where they are not JOINT and JOINT.pos.")
     ] = None,
     flip: Annotated[list[str] | None, typer.Option(help="A joint that turns the other way than the file says.")] = None,
-    unit: Annotated[str, typer.Option(help="Of the joints in the state: degrees or radians.")] = "degrees",
+    unit: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Of the joints in the state: degrees (default) or radians; of one: JOINT=UNIT, as lift=millimetres."
+        ),
+    ] = None,
     file: File = Path("calibration.json"),
 ) -> None:
     """Write an arm's links and joints into the calibration: from its link file, and a dataset that names the state's entries."""
@@ -127,7 +132,14 @@ def arm(
         raise ValueError("--joint is written JOINT=STATE_ENTRY, as elbow=elbow_flex.pos.")
     calibration = _read(file)
     names = named_state(LeRobotDataset(dataset_repo_id, root=require_dataset(dataset_root)))
-    made = make_arm(read_links(model, base), names, {left: right for left, _, right in pairs}, unit)
+    units = [text.rpartition("=") for text in unit or []]
+    of_all = [text for _, sign, text in units if not sign] or ["degrees"]
+    if len(of_all) > 1:
+        raise ValueError("--unit is given once for all joints, and as JOINT=UNIT for one.")
+    made = make_arm(
+        read_links(model, base), names, {left: right for left, _, right in pairs}, of_all[0],
+        {left: right for left, sign, right in units if sign},
+    )  # fmt: skip
     known = [each.joint for each in made.joints]
     if set(flip or []) - set(known):
         raise ValueError(f"--flip names a joint that the state does not have; it has {', '.join(known)}.")
@@ -171,15 +183,16 @@ def hand_eye(
     ),
 ) -> None:
     """Find where a camera is, and the joints' offsets, from a recording in which the arm moves and a board is seen."""
-    import numpy as np
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from lerobot_policy_pi05_geometry.dataset_folder import require_dataset
     from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
+    from lerobot_policy_pi05_geometry.geometry.kinematics import joint_kinds
     from lerobot_policy_pi05_geometry.inspect.inspection import frame_batch
     from lerobot_policy_pi05_geometry.inspect.scene import scene_figure, scene_of
     from lerobot_policy_pi05_geometry.robot.board import Board
     from lerobot_policy_pi05_geometry.robot.calibrate import calibrate_hand_eye, cameras_on_arm
+    from lerobot_policy_pi05_geometry.robot.joint_offsets import LEVER, shown
 
     changed, found = calibrate_hand_eye(
         dataset_root, dataset_repo_id, _read(file), camera, arm, link, Board.parse(board), not fixed, keep_offsets
@@ -198,18 +211,19 @@ def hand_eye(
     console.print(
         f"Noise alone leaves the camera open to {found.spread.millimetres:.1f} mm and {found.spread.degrees:.2f} "
         f"degrees; joints were off "
-        f"by {np.degrees(found.deviation):.2f} degrees. Four times as many poses leave half of it."
+        f"by {found.deviation}. Four times as many poses leave half of it."
     )
     if keep_offsets:
         console.print(
             f"The joints of '{arm}' kept their offsets. Wrote [bold]{file}[/bold]; look at [bold]{picture}[/bold]."
         )
         return
+    kinds = joint_kinds(changed.arms[arm].links)
     for joint, offset in found.offsets.items():
         told = (
             "as it was, by convention"
             if joint in found.fixed_joints
-            else f"changed by {np.degrees(offset):+.2f} degrees"
+            else f"changed by {shown(offset, LEVER if kinds[joint] == 'prismatic' else 1.0, '+.2f')}"
         )
         console.print(f"  offset of {joint}: {told}")
     others = cameras_on_arm(changed, arm, other_than=camera)
@@ -219,9 +233,8 @@ def hand_eye(
             "for what the arm carries, with --keep-offsets."
         )
     console.print(
-        f"No recording can tell the offset of {found.fixed_joints[0]} from a turn of the base, nor that of "
-        f"{found.fixed_joints[1]} from a "
-        f"turn of what the hand carries: both stay as they were. Wrote [bold]{file}[/bold]; look at [bold]{picture}[/bold]."
+        f"No recording can tell the offsets of {', '.join(found.fixed_joints)} from a motion of the base or of what the hand "
+        f"carries: they stay as they were. Wrote [bold]{file}[/bold]; look at [bold]{picture}[/bold]."
     )
 
 

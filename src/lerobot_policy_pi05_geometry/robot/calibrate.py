@@ -32,21 +32,36 @@ class ImageStream(NamedTuple):
     stream_T_depth: np.ndarray  # noqa: N815
 
 
-def make_arm(links: list[Link], names: list[str], given: dict[str, str] | None = None, unit: str = "degrees") -> Arm:
+def make_arm(
+    links: list[Link],
+    names: list[str],
+    given: dict[str, str] | None = None,
+    unit: str = "degrees",
+    units: dict[str, str] | None = None,
+) -> Arm:
     """An arm whose joints are state entries of the same name, `<joint>.pos` or `<joint>`.
 
-    names: of the dataset's state. given: joint -> state entry, where the names differ. A joint without an entry stays at 0.
+    names: of the dataset's state. given: joint -> state entry, where the names differ. A joint without an entry stays at 0. unit:
+    of all joints; a prismatic one has metres where it is an angle's. units: joint -> its unit, where that is another one.
     """
-    given = given or {}
+    given, units, kinds = given or {}, units or {}, joint_kinds(links)
+    missing = sorted((set(given) | set(units)) - set(kinds))
+    if missing:
+        raise ValueError(f"The link file has no joint {', '.join(missing)}; it has {', '.join(kinds)}.")
     unknown = sorted(set(given.values()) - set(names))
     if unknown:
         raise ValueError(f"The state has no entry {', '.join(unknown)}; it has {', '.join(names)}.")
     joints: list[StateJoint] = []
-    for joint, kind in joint_kinds(links).items():
+    for joint, kind in kinds.items():
         entry = given.get(joint) or next((n for n in (f"{joint}.pos", joint) if n in names), None)
         if entry is not None:
+            taken = next((other.joint for other in joints if other.state == entry), None)
+            if taken is not None:
+                raise ValueError(
+                    f"State entry '{entry}' is given to two joints, {taken} and {joint}; say which it is with --joint."
+                )
             metres = kind == "prismatic" and unit in ("degrees", "radians")
-            joints.append(StateJoint(joint, entry, names.index(entry), "metres" if metres else unit))
+            joints.append(StateJoint(joint, entry, names.index(entry), units.get(joint, "metres" if metres else unit)))
     if not joints:
         raise ValueError(
             f"No joint of the link file has the name of a state entry ({', '.join(names)}); say which is which with "

@@ -8,8 +8,11 @@ from lerobot.utils.constants import OBS_STATE
 from ..geometry.kinematics import ForwardKinematics
 from .board import Board
 from .hand_eye_problem import View
+from .joint_offsets import levers
 
-STILL = np.radians(0.6)  # a joint's motion over `WINDOW` frames: more, and image and state are of different poses
+STILL = np.radians(
+    0.6
+)  # a joint's motion over `WINDOW` frames: more (1 mm of a lift), and image and state are of different poses
 WINDOW = 2  # frames before and after
 MAX_VIEWS = 120  # the more the better: the noise of the joints leaves an error that falls with their root
 
@@ -25,7 +28,8 @@ def find_views(dataset: LeRobotDataset, image_key: str, kinematics: ForwardKinem
     rows = dataset.hf_dataset.select_columns([OBS_STATE, "episode_index"])[:]
     states = torch.stack([torch.as_tensor(state) for state in rows[OBS_STATE]]).double()
     values = kinematics.values(states).numpy()  # (N, J)
-    still = still_frames(values, np.array([int(number) for number in rows["episode_index"]]))
+    angles = values / levers(kinematics)
+    still = still_frames(angles, np.array([int(number) for number in rows["episode_index"]]))
     if not len(still):
         raise ValueError(
             "The arm never stands still in this dataset, so images and joints do not belong together; hold still for "
@@ -33,7 +37,7 @@ def find_views(dataset: LeRobotDataset, image_key: str, kinematics: ForwardKinem
             "pose."
         )
     views = []
-    for frame in spread_out(values, still, MAX_VIEWS):
+    for frame in spread_out(angles, still, MAX_VIEWS):
         seen = board.detect(to_pixels(dataset[frame][image_key]))
         if seen is not None:
             views.append(View(int(frame), values[frame], seen))
@@ -41,7 +45,7 @@ def find_views(dataset: LeRobotDataset, image_key: str, kinematics: ForwardKinem
 
 
 def still_frames(values: np.ndarray, episodes: np.ndarray) -> np.ndarray:
-    """Frames around which no joint moves. values: (N, J) radians. episodes: (N,)."""
+    """Frames around which no joint moves. values: (N, J) radians, or what counts as such (`levers`). episodes: (N,)."""
     count = len(values)
     calm = np.ones(count, dtype=bool)
     for shift in range(1, WINDOW + 1):
@@ -55,7 +59,10 @@ def still_frames(values: np.ndarray, episodes: np.ndarray) -> np.ndarray:
 
 
 def spread_out(values: np.ndarray, among: np.ndarray, count: int) -> list[int]:
-    """Up to `count` frames, each as far from those before it as possible (farthest-point order), none closer than 2 degrees."""
+    """Up to `count` frames, each as far from those before it as possible (farthest-point order), none closer than 2 degrees.
+
+    values: as in `still_frames`.
+    """
     chosen = [int(among[0])]
     distance = np.abs(values[among] - values[chosen[0]]).max(axis=1)
     while len(chosen) < count and distance.max() > np.radians(2):

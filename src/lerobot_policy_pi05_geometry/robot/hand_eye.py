@@ -9,7 +9,7 @@ from ..geometry.kinematics import ForwardKinematics
 from .board import Board, board_pose
 from .hand_eye_problem import HandEyeProblem, Unknowns, View
 from .hand_eye_start import closed_form_starts, mean_pose
-from .least_squares import deviation_of, fit, fit_roughly, image_error
+from .least_squares import deviation_of, fit, fit_roughly, image_error, noise_shown
 from .recording_checks import check_determined, check_views
 from .suspicions import explain
 
@@ -33,8 +33,8 @@ class HandEye:
     """What was found. camera: `link_T_camera` (wrist) or `base_T_camera` (fixed). board: `base_T_board` or `link_T_board`;
     (4, 4).
 
-    offsets: radians per joint of the chain, added to what they were. deviation: root mean square of what the joints were
-    off, radians.
+    offsets: radians or metres per joint of the chain, added to what they were. deviation: root mean square of what the joints
+    were off, as a text.
     image: pixels that remain when joints may be off. fitted: of all views. held_out: of views that a first fit did not have.
     fixed_joints: whose offsets stay as they were, by convention or because they were to be kept. views: frames of the dataset.
     """
@@ -42,7 +42,7 @@ class HandEye:
     camera: np.ndarray
     board: np.ndarray
     offsets: dict[str, float]
-    deviation: float
+    deviation: str
     image: float
     spread: "Spread"
     fitted: Residuals
@@ -53,7 +53,8 @@ class HandEye:
 
 @dataclass(frozen=True)
 class Spread:
-    """Standard deviations that follow from the noise: of the camera's pose in millimetres and degrees, of offsets in degrees."""
+    """Standard deviations that follow from the noise: of the camera's pose in millimetres and degrees, of offsets in radians
+    or metres."""
 
     millimetres: float
     degrees: float
@@ -100,7 +101,7 @@ def solve_hand_eye(
     found = solution.found
     return HandEye(
         found.camera.numpy(), found.board.numpy(), dict(zip(kinematics.joints, found.offsets.tolist(), strict=True)),
-        deviation_of(found), image_error(whole, found), spread, residuals_of(whole, found, seen),
+        noise_shown(whole, deviation_of(whole, found)), image_error(whole, found), spread, residuals_of(whole, found, seen),
         residuals_of(held_problem, measured, of_held_images), [view.frame for view in views],
         tuple(joint for joint, free in zip(kinematics.joints, whole.free.tolist(), strict=True) if not free),
     )  # fmt: skip
@@ -143,5 +144,5 @@ def _spread(problem: HandEyeProblem, covariance: np.ndarray) -> Spread:
     return Spread(
         1e3 * float(np.linalg.norm(deviations[3:6])),
         float(np.degrees(np.linalg.norm(deviations[:3]))),
-        dict(zip(named, np.degrees(deviations[12 : 12 + len(named)]).tolist(), strict=True)),
+        dict(zip(named, deviations[12 : 12 + len(named)].tolist(), strict=True)),
     )

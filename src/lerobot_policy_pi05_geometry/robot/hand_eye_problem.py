@@ -6,8 +6,8 @@
 ```
 
 Unknown besides these two poses: the joints' offsets, and how far each joint was from what it reported in each view. The offset of
-the first joint turns the base, that of the last one the mount (or the board): no recording can tell those apart, so both stay as
-they are. What is found is right for the state that is reported, which is all that a policy gets.
+the first joint moves the base, that of the last one the mount (or the board): no recording can tell those apart, so they stay as
+they are (`joint_offsets.py`). What is found is right for the state that is reported, which is all that a policy gets.
 """
 
 from dataclasses import dataclass, replace
@@ -19,15 +19,19 @@ from torch import Tensor
 from ..geometry.kinematics import ForwardKinematics
 from ..geometry.rigid import compose, inverse
 from .board import Detection
+from .joint_offsets import levers, tellable
 
 PIXEL_NOISE = 0.5  # pixels: of a corner that OpenCV has found
 _STEP = 1e-6  # radians and metres, of numerical derivatives
-JOINT_NOISE = np.radians(0.2)  # radians: backlash and resolution of a hobby servo
+JOINT_NOISE = np.radians(
+    0.2
+)  # radians: backlash and resolution of a hobby servo; 0.35 mm of a prismatic joint (`levers`)
 
 
 @dataclass(frozen=True)
 class View:
-    """One image with the board in it. frame: of the dataset. values (J,): of the chain's joints, radians, before offsets."""
+    """One image with the board in it. frame: of the dataset. values (J,): of the chain's joints, radians or metres, without
+    offsets."""
 
     frame: int
     values: np.ndarray
@@ -38,9 +42,8 @@ class View:
 class Unknowns:
     """camera: `link_T_camera` of a wrist camera, `base_T_camera` of a fixed one. board: `base_T_board`, or `link_T_board`.
 
-    All (4, 4) float64. offsets (J,): radians, added to the joints' values. deviations (V, J): per view, radians. more
-    (M,): what only
-    some problems have (`suspicions.py`). All but `deviations` may have a batch dimension in front.
+    All (4, 4) float64. offsets (J,): radians or metres, added to the joints' values. deviations (V, J): per view, in the same.
+    more (M,): what only some problems have (`suspicions.py`). All but `deviations` may have a batch dimension in front.
     """
 
     camera: Tensor
@@ -54,7 +57,7 @@ class HandEyeProblem:
     """Predicted and seen corners of some views. wrist: the camera moves and the board lies still, or the other way round.
 
     intrinsics: fx, fy, cx, cy of the images. distortion: OpenCV's five numbers. keep_offsets: the arm's are known. free: which
-    joints' offsets are unknown.
+    joints' offsets are unknown. noise (J,): of the joints' values, radians or metres.
     """
 
     more = 0  # how many numbers a kind of problem has besides
@@ -76,8 +79,8 @@ class HandEyeProblem:
         self.pixels = torch.from_numpy(np.concatenate([view.seen.pixels for view in views]))  # (N, 2)
         points = np.concatenate([corners[view.seen.ids] for view in views])
         self.points = torch.from_numpy(np.concatenate([points, np.ones((len(points), 1))], axis=1))  # (N, 4)
-        joints = len(kinematics.joints)
-        self.free = torch.tensor([0 < number < joints - 1 and not keep_offsets for number in range(joints)])
+        self.free = torch.tensor([can_tell and not keep_offsets for can_tell in tellable(kinematics)])
+        self.noise = JOINT_NOISE * levers(kinematics)
 
     def start(self, camera: np.ndarray, board: np.ndarray) -> Unknowns:
         """Unknowns with these poses, and every joint where it says it is."""

@@ -1,8 +1,9 @@
 """Least squares over the unknowns of a hand-eye calibration (scipy), with exact derivatives (torch).
 
-A joint that is off moves all corners of its view together: their errors are no independent noise. With pixel noise s, joint noise
-t and derivatives A by the joints, a view's errors have the covariance s² I + t² A Aᵀ; its Cholesky factor makes them independent
-and of size 1. That is generalised least squares, and the same as solving for every joint of every view with a prior.
+A joint that is off moves all corners of its view together: their errors are no independent noise. With pixel noise s and
+derivatives A by the joints in units of their noise, a view's errors have the covariance s² I + A Aᵀ; its Cholesky factor makes
+them independent and of size 1. That is generalised least squares, and the same as solving for every joint of every view with a
+prior.
 """
 
 from dataclasses import replace
@@ -14,7 +15,8 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from .hand_eye_problem import JOINT_NOISE, PIXEL_NOISE, HandEyeProblem, Unknowns
+from .hand_eye_problem import PIXEL_NOISE, HandEyeProblem, Unknowns
+from .joint_offsets import levers, shown
 
 MAX_DEVIATION = 3.0  # times the noise of a joint: more is no noise
 MAX_IMAGE = 2.0  # pixels that remain when joints may be off
@@ -75,8 +77,8 @@ def _of_views(problem: HandEyeProblem, rows: Tensor) -> list[np.ndarray]:
 def _covariance_factors(problem: HandEyeProblem, at: Unknowns) -> list[np.ndarray]:
     _, by_joints = problem.derivatives(at, torch.zeros(problem.size, dtype=torch.float64))
     return [
-        np.linalg.cholesky(PIXEL_NOISE**2 * np.eye(len(part)) + JOINT_NOISE**2 * part @ part.T)
-        for part in _of_views(problem, by_joints)
+        np.linalg.cholesky(PIXEL_NOISE**2 * np.eye(len(part)) + part @ part.T)
+        for part in _of_views(problem, by_joints * torch.from_numpy(problem.noise))
     ]
 
 
@@ -85,7 +87,7 @@ def with_deviations(problem: HandEyeProblem, found: Unknowns) -> Unknowns:
     found = replace(found, deviations=torch.zeros_like(found.deviations))
     _, by_joints = problem.derivatives(found, torch.zeros(problem.size, dtype=torch.float64))
     errors = _of_views(problem, problem.errors(found).flatten())
-    prior = np.eye(by_joints.shape[1]) * (PIXEL_NOISE / JOINT_NOISE) ** 2
+    prior = np.diag((PIXEL_NOISE / problem.noise) ** 2)
     deviations = [
         -np.linalg.solve(part.T @ part + prior, part.T @ error)
         for part, error in zip(_of_views(problem, by_joints), errors, strict=True)
@@ -93,9 +95,15 @@ def with_deviations(problem: HandEyeProblem, found: Unknowns) -> Unknowns:
     return replace(found, deviations=torch.from_numpy(np.stack(deviations)))
 
 
-def deviation_of(found: Unknowns) -> float:
-    """By how much joints had to be off, radians: root mean square over a view's joints, of the median view."""
-    return float(found.deviations.square().mean(dim=1).sqrt().median())
+def deviation_of(problem: HandEyeProblem, found: Unknowns) -> float:
+    """By how many times their noise joints had to be off: root mean square over a view's joints, of the median view."""
+    return float((found.deviations / torch.from_numpy(problem.noise)).square().mean(dim=1).sqrt().median())
+
+
+def noise_shown(problem: HandEyeProblem, times: float) -> str:
+    """So many times the joints' noise, in degrees, and in millimetres if there are prismatic joints."""
+    kinds = {lever: times * noise for lever, noise in zip(levers(problem.kinematics), problem.noise, strict=True)}
+    return " and ".join(shown(kinds[lever], lever, ".2f") for lever in sorted(kinds, reverse=True))
 
 
 def image_error(problem: HandEyeProblem, found: Unknowns) -> float:
@@ -105,4 +113,4 @@ def image_error(problem: HandEyeProblem, found: Unknowns) -> float:
 
 def fits(problem: HandEyeProblem, found: Unknowns) -> bool:
     """Whether what remains is noise."""
-    return deviation_of(found) <= MAX_DEVIATION * JOINT_NOISE and image_error(problem, found) <= MAX_IMAGE
+    return deviation_of(problem, found) <= MAX_DEVIATION and image_error(problem, found) <= MAX_IMAGE

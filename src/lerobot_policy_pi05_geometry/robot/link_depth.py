@@ -20,6 +20,7 @@ from ..geometry.keys import RAW_STATE, find_depth_key, find_depth_keys
 from ..geometry.kinematics import Arm, ForwardKinematics
 from ..geometry.placed_camera import PlacedCamera
 from .dataset_views import spread_out, still_frames
+from .joint_offsets import levers
 from .link_files import body_name
 
 MAX_SCALE_ERROR = 0.10
@@ -196,7 +197,7 @@ def _frames(dataset: LeRobotDataset, kinematics: ForwardKinematics) -> list[int]
     """Frames in which the arm stands in different poses, and stands still if it ever does."""
     rows = dataset.hf_dataset.select_columns([OBS_STATE, "episode_index"])[:]
     states = torch.stack([torch.as_tensor(state) for state in rows[OBS_STATE]]).double()
-    values = kinematics.values(states).numpy()
+    values = kinematics.values(states).numpy() / levers(kinematics)
     still = still_frames(values, np.array([int(number) for number in rows["episode_index"]]))
     return spread_out(values, still if len(still) >= _FRAMES else np.arange(len(values)), _FRAMES)
 

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ..geometry.kinematics import ForwardKinematics
 from .hand_eye_problem import View
+from .joint_offsets import levers, shown, tellable
 
 if TYPE_CHECKING:
     from .hand_eye import Spread
@@ -15,8 +16,9 @@ if TYPE_CHECKING:
 MIN_VIEWS = 12
 MIN_TURN = np.radians(30)  # between the two views whose links are turned furthest from each other
 MIN_TILT = np.radians(15)  # of the axes that the link turned about
-MIN_MOTION = np.radians(8)  # of each joint
-MAX_OFFSET_SPREAD = 1.5  # degrees
+# Radians of each joint whose offset is sought; metres of a prismatic one times `LEVER`: 14 mm, and 2.6 mm.
+MIN_MOTION = np.radians(8)
+MAX_OFFSET_SPREAD = np.radians(1.5)
 MAX_POSE_SPREAD = 6.0, 1.5  # millimetres, degrees
 
 
@@ -33,7 +35,8 @@ def check_views(
             "board well lit and whole in the image, holding still for a second in each."
         )
     values = np.stack([view.values for view in views])
-    spans = np.ptp(values, axis=0)
+    by = levers(kinematics)
+    spans = np.ptp(values, axis=0) / by
     board_turn = _largest_turn(seen[:, :3, :3])
     if board_turn > MIN_TURN and spans.max() < np.radians(0.5):
         raise ValueError(
@@ -54,26 +57,26 @@ def check_views(
             f"camera's place along "
             "it open; tilt the hand in two directions, and roll it."
         )
-    free = range(1, len(kinematics.joints) - 1)
-    still = [kinematics.joints[j] for j in free if spans[j] < MIN_MOTION]
+    still = [number for number, free in enumerate(tellable(kinematics)) if free and spans[number] < MIN_MOTION]
     if still and not keep_offsets:
+        needed = " and ".join(dict.fromkeys(shown(MIN_MOTION * by[number], by[number], ".0f") for number in still))
         raise ValueError(
-            f"Joint(s) {', '.join(still)} moved by less than {np.degrees(MIN_MOTION):.0f} degrees, so nothing says "
-            f"what their offset is; "
-            "move every joint between poses."
+            f"Joint(s) {', '.join(kinematics.joints[number] for number in still)} moved by less than {needed}, so nothing says "
+            "what their offset is; move every joint between poses."
         )
 
 
 def check_determined(kinematics: ForwardKinematics, views: list[View], spread: "Spread") -> None:
     """Raise ValueError if the noise alone leaves an offset or the camera's pose open."""
-    open_ = {joint: value for joint, value in spread.offsets.items() if value > MAX_OFFSET_SPREAD}
-    if open_:
-        joint = max(open_, key=lambda name: open_[name])
-        span = np.degrees(np.ptp([view.values[kinematics.joints.index(joint)] for view in views]))
+    by = dict(zip(kinematics.joints, levers(kinematics), strict=True))
+    joint, wide = max(
+        ((name, value / by[name]) for name, value in spread.offsets.items()), key=lambda pair: pair[1], default=("", 0)
+    )
+    if wide > MAX_OFFSET_SPREAD:
+        span = np.ptp([view.values[kinematics.joints.index(joint)] for view in views])
         raise ValueError(
-            f"The views leave the offset of joint '{joint}' open (to {open_[joint]:.1f} degrees; it moved over "
-            f"{span:.0f}): move it "
-            "further, together with the joints before and after it."
+            f"The views leave the offset of joint '{joint}' open (to {shown(spread.offsets[joint], by[joint])}; it moved over "
+            f"{shown(span, by[joint], '.0f')}): move it further, together with the joints before and after it."
         )
     if spread.millimetres > MAX_POSE_SPREAD[0] or spread.degrees > MAX_POSE_SPREAD[1]:
         raise ValueError(

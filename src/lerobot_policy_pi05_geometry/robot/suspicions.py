@@ -8,7 +8,8 @@ from torch import Tensor
 
 from .board import Board
 from .hand_eye_problem import HandEyeProblem, Unknowns, nudged
-from .least_squares import deviation_of, fit, fit_roughly, fits, image_error
+from .joint_offsets import LEVER, levers
+from .least_squares import deviation_of, fit, fit_roughly, fits, image_error, noise_shown
 
 NOTICEABLE = 0.04  # a joint's motion or a board's size is off by 4 %
 CERTAIN = 5.0  # and by so many standard deviations
@@ -59,7 +60,7 @@ def explain(problem: HandEyeProblem, found: Unknowns, board: Board) -> str | Non
     A wrong scale may pass for noise, since a mount and joints that are off hide most of it; so scales are looked at in any case.
     """
     told = (
-        f"The views contradict each other (joints would have to be {np.degrees(deviation_of(found)):.1f} degrees off, and "
+        f"The views contradict each other (joints would have to be {noise_shown(problem, deviation_of(problem, found))} off, and "
         f"{image_error(problem, found):.1f} pixels remain)"
     )
     good = fits(problem, found)
@@ -73,10 +74,15 @@ def explain(problem: HandEyeProblem, found: Unknowns, board: Board) -> str | Non
     factors, certain = _fitted(problem, JointFactors, found)
     if certain is not None and certain.any():
         joint = int(np.argmax(np.where(certain, factors.more.abs().numpy(), 0)))
+        slides = levers(problem.kinematics)[joint] == LEVER
+        reason = (
+            "is no distance in the joint's unit; say it with `pi05-geometry calibrate arm --unit JOINT=UNIT`."
+            if slides
+            else "is no angle in degrees; record with --robot.use_degrees=true, and check the joint's unit."
+        )
         return (
             f"{told}: joint '{problem.kinematics.joints[joint]}' moves {1 + float(factors.more[joint]):.2f} times as "
-            f"far as the state "
-            "says, so the state is no angle in degrees; record with --robot.use_degrees=true, and check the joint's unit."
+            f"far as the state says, so the state {reason}"
         )
     if good:
         return None
