@@ -193,17 +193,22 @@ def test_values_are_looked_into_once_an_episode():
         encoder(wrong_unit)
 
 
+@pytest.mark.parametrize("optional", [(), ("wrist",)])
 @pytest.mark.parametrize("training", [True, False])
-def test_a_pose_that_was_never_there_is_an_error(training):
+def test_a_pose_that_was_never_there_is_an_error(training, optional):
+    """Of an optional camera, too: its depth would count for nothing, without a word."""
     encoder = GeometryEncoder(make_source({"wrist": calibrated(12, 18)}, 2), 16).train(training)
+    encoder.source.optional = frozenset(optional)
     with pytest.raises(ValueError, match=r"no depth from camera\(s\) wrist.*observation.calibration.wrist.extrinsics"):
         encoder(observe(encoder))
 
 
+@pytest.mark.parametrize("optional", [(), ("wrist",)])
 @pytest.mark.parametrize("pose", ["missing", "NaN"])
-def test_a_pose_that_fails_in_the_middle_of_an_episode_is_masked_like_depth(pose):
+def test_a_pose_that_fails_in_the_middle_of_an_episode_is_masked_like_depth(pose, optional):
     """A wrist camera without its pose measures nothing that could be placed in the base frame."""
     encoder = GeometryEncoder(make_source({"wrist": calibrated(12, 18)}, 2), 16).eval()
+    encoder.source.optional = frozenset(optional)
     observation = observe(encoder) | {extrinsics_key("wrist"): random_pose(generator(3))[None].float()}
     encoder(observation)
     if pose == "missing":

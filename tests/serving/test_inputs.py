@@ -205,6 +205,19 @@ def test_an_optional_depth_camera_may_be_missing_from_the_start():
         make_inputs(optional_depth_cameras=["wrist"]).read(request)
 
 
+def test_depth_of_an_optional_camera_needs_its_pose():
+    inputs, request = make_inputs(optional_depth_cameras=["wrist"]), make_request()
+    seen = inputs.read(request).observation
+    lost = without(request, "extrinsics")
+    with pytest.raises(RequestError, match=f"has {WRIST_DEPTH}, but not {WRIST_POSE}, which it needs"):
+        inputs.read(lost)
+    found = inputs.read(lost, seen).observation  # it has failed: the camera is masked, as one that is away
+    assert WRIST_DEPTH not in found
+    assert FRONT_DEPTH in found
+    both = make_inputs(optional_depth_cameras=["wrist"], geometry_frame="camera")
+    assert WRIST_DEPTH in both.read(lost).observation
+
+
 def test_a_pose_may_come_as_datasets_store_it():
     request = make_request()
     expected = make_inputs().read(request).observation[WRIST_POSE]

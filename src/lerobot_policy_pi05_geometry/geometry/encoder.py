@@ -84,7 +84,7 @@ class GeometryEncoder(nn.Module):
 
     def _measured(self, batch: Mapping[str, Tensor]) -> GeometryFeatures:
         """Features of a training batch, where every camera that is not optional must be present."""
-        missing = [camera for camera in self.source.missing_cameras(batch) if camera not in self.source.optional]
+        missing = [name for name in self.source.missing_cameras(batch) if not self.source.may_lack(name, batch)]
         if missing:
             raise ValueError(self.source.missing_message(missing))
         check = batch_like(batch).device.type == "cpu" or self._check_is_due()
@@ -98,7 +98,7 @@ class GeometryEncoder(nn.Module):
         """Features at inference: a camera that fails is masked, once it has been seen."""
         self._update_status()
         missing = self.source.missing_cameras(batch)
-        unknown = [camera for camera in missing if camera not in self._seen | self.source.optional]
+        unknown = [name for name in missing if name not in self._seen and not self.source.may_lack(name, batch)]
         if unknown:
             raise ValueError(self.source.missing_message(unknown))
         rows = range(batch_like(batch).shape[0])

@@ -67,6 +67,10 @@ class RgbdSource(GeometrySource):
             if find_depth_key(camera, batch, self.depth_keys) is None or not self._has_pose(camera, batch)
         ]
 
+    def may_lack(self, camera: str, batch: Mapping[str, Tensor]) -> bool:
+        """An optional camera may be away; depth without the pose that it needs is an error of the data."""
+        return camera in self.optional and find_depth_key(camera, batch, self.depth_keys) is None
+
     def missing_message(self, cameras: list[str]) -> str:
         keys = ", ".join(self._expected_key(camera) for camera in cameras)
         on_arm = [camera for camera in cameras if self.base_frame and self.placed[camera].on_arm]

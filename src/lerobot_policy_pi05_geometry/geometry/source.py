@@ -43,6 +43,10 @@ class GeometrySource(nn.Module, ABC):
     def missing_cameras(self, batch: Mapping[str, Tensor]) -> list[str]:
         """Cameras that have no data in this batch."""
 
+    def may_lack(self, camera: str, batch: Mapping[str, Tensor]) -> bool:
+        """Whether this observation may lack this camera, which `missing_cameras` names."""
+        return camera in self.optional
+
     def missing_message(self, cameras: list[str]) -> str:
         """One sentence on what was expected from these cameras and what to do."""
         return f"The observation has nothing from camera(s) {', '.join(cameras)}, which geometry needs; connect them."

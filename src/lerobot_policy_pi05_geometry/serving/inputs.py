@@ -99,6 +99,7 @@ class Inputs:
         self._noise_shape = (config.chunk_size, config.max_action_dim)
         self._chunk_size = config.chunk_size
         self.expected = {entry.key: entry for entry in _expected(config)}
+        self._poses = dict(_poses_of_optional(config))
         self.trained_size = {key: tuple(feature.shape[-2:]) for key, feature in config.image_features.items()}
         renamed = {name: key for name, key in (rename_map or {}).items() if key in self.expected}
         # The policy's names, which the metadata lists, come first: with cameras swapped, the data's mean another camera.
@@ -151,6 +152,13 @@ class Inputs:
                     continue
                 key = depth
             observation[key] = np.zeros(self.expected[key].shape, dtype=np.float32)
+        for depth, pose in self._poses.items():
+            if depth in observation and pose not in observation:
+                if pose not in seen:
+                    raise RequestError(
+                        f"The request has {depth}, but not {pose}, which it needs; send both, or neither."
+                    )
+                del observation[depth]  # the pose has failed
 
     def key_of(self, name: str) -> str | None:
         """The key that a name in a request stands for; None for one that is not expected."""
@@ -251,6 +259,14 @@ def _pose(config: PI05GeometryConfig, camera: str, needed: bool) -> Input:
     placed = all(_is_placed(cameras.get(camera)) for cameras in rigs)
     unit = "base_T_camera in metres, OpenCV axes"
     return Input(extrinsics_key(camera), _POSE, _FLOATS, unit, needed and not placed)
+
+
+def _poses_of_optional(config: PI05GeometryConfig) -> Iterable[tuple[str, str]]:
+    """Keys of depth and pose of the cameras that a request may lack, whose pose comes with every frame."""
+    if config.geometry_source == "rgbd" and config.geometry_frame == "base":
+        for camera in config.optional_depth_cameras:
+            if _pose(config, camera, needed=True).required:
+                yield depth_key(camera), extrinsics_key(camera)
 
 
 def _is_placed(camera: CameraCalibration | None) -> bool:
