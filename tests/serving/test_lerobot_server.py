@@ -302,6 +302,67 @@ def test_the_client_silent_for_longest_makes_room(engine, monkeypatch):
         refused(lambda: second.send(observe()), grpc.StatusCode.FAILED_PRECONDITION, "not known here")
 
 
+def test_the_only_client_continues_after_its_connection_was_dropped(port, engine, monkeypatch):
+    """It comes from another port, and does not say again what its robot is."""
+    monkeypatch.setattr(grpc_server, "_GONE", 1e6)
+    before, after = Client(port).begin(), Client(port)
+    before.send(observe(value=0.5))
+    before.actions()
+    refused(lambda: after.send(observe(1)), grpc.StatusCode.FAILED_PRECONDITION, "not known here")
+    before.channel.close()
+    monkeypatch.setattr(grpc_server, "_GONE", 0.0)
+    for _ in range(100):  # the server may hear of the end of the last call a little later
+        try:
+            after.send(observe(1, value=0.25))
+            break
+        except grpc.RpcError:
+            time.sleep(0.05)
+    assert [action.get_action()[0] for action in after.actions()] == [0.25] * 4
+    first, last = (batch[0] for batch in (engine.batches[0], engine.batches[-1]))
+    assert last.begins
+    assert not torch.equal(first.noise, last.noise)
+    after.send(observe(2))
+    after.actions()
+    assert not engine.batches[-1][0].begins
+
+
+class Call:
+    """A call of a client at an address, as gRPC tells a servicer of it."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+
+    def peer(self) -> str:
+        return self.address
+
+    def add_callback(self, callback) -> bool:
+        self.end = callback
+        return True
+
+    def abort(self, code, details):
+        raise LookupError(details)
+
+
+def test_a_client_whose_call_is_in_progress_is_not_gone(engine, monkeypatch):
+    monkeypatch.setattr(grpc_server, "_GONE", -1.0)
+    servicer = grpc_server.LeRobotServicer(fake_posed(engine), 0, 10.0)
+    servicer.Ready(None, Call("a"))
+    servicer.SendPolicyInstructions(services_pb2.PolicySetup(data=pickle.dumps(instructions())), started := Call("a"))
+    started.end()
+    asking, sending = Call("a"), Call("a")
+    known = servicer._client(asking)
+    assert servicer._client(sending) is known
+    sending.end()
+    with pytest.raises(LookupError, match="not known here"):
+        servicer._client(Call("b"))
+    asking.end()
+    returned = servicer._client(Call("b"))
+    assert returned.robot is known.robot
+    assert returned.session.name != known.session.name
+    with pytest.raises(LookupError, match="not known here"):
+        servicer._client(Call("a"))
+
+
 def test_others_cannot_reach_it(engine):
     for host in ("0.0.0.0", "::", "10.1.2.3"):
         with pytest.raises(ValueError, match="would serve everyone; listen on 127"):

@@ -2,6 +2,9 @@
 
 A session per client, by its address. The policy is the one that is served, whatever a client names. LeRobot's client cannot send
 a key and does not encrypt, so this listens on loopback only; from another machine it is reached through an SSH tunnel.
+
+A client whose connection was dropped has another address afterwards, and says what its robot is only when it is started. If it
+was the only one, it continues in a new session; among several it cannot be told which one it was, and it is refused.
 """
 
 import logging
@@ -9,10 +12,12 @@ import pickle
 import secrets
 import signal
 import threading
+import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NoReturn
 
 import grpc
@@ -36,13 +41,16 @@ _MESSAGE_BYTES = 4 * MIB  # robot_client sends an observation in pieces of 2 MiB
 _INSTRUCTION_BYTES = 1 * MIB
 _CLIENTS = 16  # each holds up to two threads: one sends, one waits for actions
 _SENDING = 30.0  # seconds that an observation may take to arrive; its call holds a thread
+_GONE = 1.0  # seconds without a call in progress, after which a client is gone: it asks for actions all the time
 _WAIT = 2.0  # seconds that GetActions waits for an observation, before it answers with nothing
 
 
 @dataclass
 class _Client:
-    """What is kept of one robot_client."""
+    """What is kept of one robot_client. calls: how many are in progress. heard: when the last one ended."""
 
+    calls: int = 0
+    heard: float = field(default_factory=time.monotonic)
     session: Session = field(default_factory=Session)
     robot: Robot | None = None
     changed: threading.Condition = field(default_factory=threading.Condition)
@@ -50,6 +58,10 @@ class _Client:
     asking: threading.Lock = field(default_factory=threading.Lock)
     sending: threading.Lock = field(default_factory=threading.Lock)
     answered: deque[int] = field(default_factory=lambda: deque(maxlen=1000))  # steps
+
+    @property
+    def gone(self) -> bool:
+        return not self.calls and time.monotonic() - self.heard > _GONE
 
 
 class LeRobotServicer(services_pb2_grpc.AsyncInferenceServicer):
@@ -156,8 +168,11 @@ class LeRobotServicer(services_pb2_grpc.AsyncInferenceServicer):
 
     def _client(self, context: grpc.ServicerContext) -> _Client:
         with self._lock:
-            client = self._clients.get(context.peer())
+            client = self._clients.get(context.peer()) or self._returned(context)
             if client is not None:
+                client.calls += context.add_callback(
+                    partial(self._end_call, client)
+                )  # True, unless it has ended already
                 self._clients.move_to_end(context.peer())
         if client is None:
             context.abort(
@@ -165,6 +180,20 @@ class LeRobotServicer(services_pb2_grpc.AsyncInferenceServicer):
             )
         assert client is not None
         return client
+
+    def _end_call(self, client: _Client) -> None:
+        with self._lock:
+            client.calls, client.heard = client.calls - 1, time.monotonic()
+
+    def _returned(self, context: grpc.ServicerContext) -> _Client | None:
+        """The only robot, in a new session, if its connection was dropped; None if this is someone else."""
+        clients = list(self._clients.values())
+        if len(clients) != 1 or clients[0].robot is None or not clients[0].gone:
+            return None
+        logger.warning("The robot_client was lost; %s continues as its robot, in a new session.", context.peer())
+        self._clients.clear()
+        self._clients[context.peer()] = _Client(robot=clients[0].robot)
+        return self._clients[context.peer()]
 
 
 def _refuse(context: grpc.ServicerContext, error: RequestError) -> NoReturn:
