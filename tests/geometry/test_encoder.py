@@ -138,6 +138,25 @@ def test_a_camera_that_fails_in_one_row_of_a_batch_is_masked_and_said(caplog):
     assert "'front' delivers no geometry in row 1 of the batch" in warning
 
 
+def test_robots_in_turn_of_which_one_has_lost_a_camera_do_not_fill_the_log(caplog):
+    """A server computes them as the same row."""
+    caplog.set_level(logging.INFO)
+    encoder = make_encoder("left", "right")
+    for episode in range(2):
+        encoder.reset()
+        caplog.clear()
+        encoder(observe(encoder))
+        for request in range(5):
+            encoder(failing(observe(encoder, request), "right", "missing"))
+            encoder(observe(encoder, request))
+        texts = [record.getMessage() for record in caplog.records]
+        assert len(texts) == 3, episode
+        assert all(
+            f"'right' {said}" in text
+            for said, text in zip(("delivers no", "is back", "fails again"), texts, strict=True)
+        )
+
+
 def test_what_one_episode_saw_says_nothing_about_the_next(caplog):
     """After robot A, robot B without a depth camera is refused, not masked."""
     encoder = make_encoder("left", "right")

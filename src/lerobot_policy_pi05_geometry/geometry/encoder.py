@@ -1,14 +1,15 @@
 """Source and adapter together, and the handling of a camera that fails.
 
 In training, a missing camera or a frame of NaN is an error of the data. On a robot, a camera that has delivered geometry may
-fail: its key is missing, or no pixel is valid. Its tokens are then masked, and used again when it returns; both are logged once.
+fail: its key is missing, or no pixel is valid. Its tokens are then masked, and used again when it returns; both are logged once,
+and once more that it fails again: a server computes one robot after the other, and would log a failed camera with every request.
 A robot that does not deliver the key in the first observation of an episode is configured wrongly, which is an error. All of this
-belongs to one episode and to one row of a batch: what one robot's camera did says nothing about another's. On a GPU a
-failure is logged one observation
-later, so that no chunk waits for the copy to the host.
+belongs to one episode and to one row of a batch: what one robot's camera did says nothing about another's. On a GPU a failure is
+logged one observation later, so that no chunk waits for the copy to the host.
 """
 
 import logging
+from collections import Counter
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -68,6 +69,7 @@ class GeometryEncoder(nn.Module):
         self.adapter = make_adapter(source, width)
         self._seen: set[str] = set()
         self._failed: set[tuple[int, str]] = set()  # rows and cameras
+        self._failures: Counter[tuple[int, str]] = Counter()  # how often in this episode
         self._checked: set[int] = set()  # rows
         self._unread: _CameraStatus | None = None
         self._training_batches = 0
@@ -76,6 +78,7 @@ class GeometryEncoder(nn.Module):
         """Start of an episode, maybe of another robot: no camera has been seen, and none has failed."""
         self._update_status()
         self._seen, self._failed, self._checked = set(), set(), set()
+        self._failures.clear()
 
     def forward(self, batch: Mapping[str, Tensor]) -> GeometryTokens:
         # A caller's autocast would round points to millimetres, and training has another autocast than inference.
@@ -137,19 +140,30 @@ class GeometryEncoder(nn.Module):
         )
 
     def _report(self, failed: set[tuple[int, str]], size: int) -> None:
-        """Log once that a camera failed, and once that it is back. size: rows of the batch.
+        """Log once that a camera failed, once that it is back, and once that it fails again. size: rows of the batch.
 
         An optional camera that the episode has not seen may stay away without a word.
         """
         expected = self._seen | (set(self.source.cameras) - self.source.optional)
-        for camera in self.source.cameras:
-            gone = [row for row, name in sorted(failed - self._failed) if name == camera]
-            back = [row for row, name in sorted(self._failed - failed) if name == camera]
-            if gone and camera in expected:
-                message = "Geometry camera '%s' delivers no geometry%s: its tokens are masked until it returns."
-                logger.warning(message, camera, _rows(gone, size))
-            if back and camera in expected:
-                logger.info("Geometry camera '%s' is back%s.", camera, _rows(back, size))
+        self._failures.update((row, name) for row, name in failed - self._failed if name in expected)
+
+        def log(level: int, message: str, changed: set[tuple[int, str]], failures: int) -> None:
+            for camera in self.source.cameras:
+                rows = [
+                    row for row, name in sorted(changed) if name == camera and self._failures[row, name] == failures
+                ]
+                if rows and camera in expected:
+                    logger.log(level, message, camera, _rows(rows, size))
+
+        gone, masked = failed - self._failed, "its tokens are masked until it returns"
+        log(logging.WARNING, f"Geometry camera '%s' delivers no geometry%s: {masked}.", gone, 1)
+        log(
+            logging.WARNING,
+            f"Geometry camera '%s' fails again%s: {masked}, and this episode reports it no more.",
+            gone,
+            2,
+        )
+        log(logging.INFO, "Geometry camera '%s' is back%s.", self._failed - failed, 1)
         self._failed = failed
 
 
