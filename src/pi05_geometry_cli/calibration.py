@@ -186,7 +186,7 @@ def hand_eye(
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from lerobot_policy_pi05_geometry.dataset_folder import require_dataset
-    from lerobot_policy_pi05_geometry.geometry.calibration import write_calibration_file
+    from lerobot_policy_pi05_geometry.geometry.calibration import Rig, write_calibration_file
     from lerobot_policy_pi05_geometry.geometry.kinematics import joint_kinds
     from lerobot_policy_pi05_geometry.inspect.inspection import frame_batch
     from lerobot_policy_pi05_geometry.inspect.scene import scene_figure, scene_of
@@ -198,8 +198,11 @@ def hand_eye(
         dataset_root, dataset_repo_id, _read(file), camera, arm, link, Board.parse(board), not fixed, keep_offsets
     )
     write_calibration_file(file, changed)
+    # The recording may be of one arm of several: another one's state is not in it.
+    cameras = {key: each for key, each in changed.cameras.items() if each.mount is None or each.mount.arm == arm}
     scene = scene_of(
-        frame_batch(LeRobotDataset(dataset_repo_id, root=require_dataset(dataset_root)), found.views[0]), changed
+        frame_batch(LeRobotDataset(dataset_repo_id, root=require_dataset(dataset_root)), found.views[0]),
+        Rig(cameras, {arm: changed.arms[arm]}),
     )
     scene_figure(scene).savefig(picture, dpi=130)
     console.print(f"{len(found.views)} views. Board in the image and as predicted from the reported joints:")

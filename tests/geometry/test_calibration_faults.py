@@ -97,9 +97,13 @@ def test_a_translation_in_millimetres_is_refused():
         policy.geometry.source(observation)
 
 
-def test_rigs_have_numbers():
+@pytest.mark.parametrize("name", ["left", "01", "-1", "1.0", ""])
+def test_rigs_have_numbers(name):
+    """01 and 1 would be the same rig."""
     with pytest.raises(ValueError, match="give a whole number as its name"):
-        parse_calibration({"version": 2, "frame": "base", "rigs": {"left": {"cameras": {}}}}, "file")
+        parse_calibration({"version": 2, "frame": "base", "rigs": {name: {"cameras": {}}}}, "file")
+    for known in ("0", "10"):
+        parse_calibration({"version": 2, "frame": "base", "rigs": {known: {"cameras": {}}}}, "file")
 
 
 # --- which entries of the state an arm's joints are -----------------------------------------------------------------

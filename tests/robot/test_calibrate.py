@@ -17,7 +17,7 @@ from lerobot_policy_pi05_geometry.geometry.kinematics import Arm, ForwardKinemat
 from lerobot_policy_pi05_geometry.robot import realsense
 from lerobot_policy_pi05_geometry.robot.board import Board
 from lerobot_policy_pi05_geometry.robot.calibrate import check_board_depth, image_stream, keep_offsets, make_arm
-from lerobot_policy_pi05_geometry.robot.dataset_views import spread_out, still_frames
+from lerobot_policy_pi05_geometry.robot.dataset_views import image_size, spread_out, still_frames
 from lerobot_policy_pi05_geometry.robot.link_files import read_links
 from pi05_geometry_cli import app
 from tests.geometry.arms import STATE_NAMES, URDF, mjcf_of, random_arm, random_state, so101_like
@@ -215,6 +215,12 @@ def test_moving_frames_are_left_out():
     assert still_frames(values, np.arange(12) // 6).tolist() == list(range(12))  # another episode is no motion
 
 
+def test_the_size_of_images_is_read_in_either_order():
+    assert image_size({"shape": (480, 640, 3), "names": ["height", "width", "channels"]}) == (480, 640)
+    assert image_size({"shape": [3, 480, 640], "names": ["channels", "height", "width"]}) == (480, 640)
+    assert image_size({"shape": [480, 640, 3], "names": None}) == (480, 640)
+
+
 def test_frames_are_spread_out():
     values = np.radians([[0.0], [1.0], [10.0], [10.5], [40.0], [41.0]])
     assert spread_out(values, np.arange(6), 3) == [0, 5, 3]
@@ -295,7 +301,11 @@ def test_the_commands_calibrate_a_fixed_camera(tmp_path):
     assert "elbow_flex.pos" in run("arm", f"--model={tmp_path / 'arm.urdf'}", root)
     carried = replace(camera, mount=Mount("arm", "gripper", np.eye(4).tolist()))
     arms = read_calibration_file(file).arms
-    write_calibration_file(file, Calibration({"front": camera, "wrist": carried}, arms))
+    # The recording is of one arm of two: the other one's joints are no entries of its state.
+    far = [replace(joint, state=f"other_{joint.state}", index=joint.index + 6) for joint in arms["arm"].joints]
+    arms["other"] = replace(arms["arm"], joints=far)
+    elsewhere = replace(camera, mount=Mount("other", "gripper", np.eye(4).tolist()))
+    write_calibration_file(file, Calibration({"front": camera, "wrist": carried, "elsewhere": elsewhere}, arms))
     options = ("--camera=front", "--link=gripper", "--fixed", "--board=7x5:30:22", root)
     told = run("hand-eye", *options, f"--picture={tmp_path / 'scene.png'}")
     assert "held out" in told

@@ -137,10 +137,12 @@ def test_where_they_go_in_a_calibration():
         with_intrinsics("front", replace(old, rotation=90), found)
 
 
-def record(root: Path, count: int) -> None:
+def record(root: Path, count: int, channels_first: bool = False) -> None:
     """Images of the board, as a pinhole of the intrinsics TRUE sees it."""
     random = np.random.default_rng(8)
     feature = {"dtype": "image", "shape": (SIZE[1], SIZE[0], 3), "names": ["height", "width", "channels"]}
+    if channels_first:
+        feature |= {"shape": (3, SIZE[1], SIZE[0]), "names": ["channels", "height", "width"]}
     features = {"observation.images.front": feature}
     dataset = LeRobotDataset.create("local/board", fps=5, features=features, root=root, use_videos=False)
     fx, fy, cx, cy = TRUE
@@ -150,13 +152,17 @@ def record(root: Path, count: int) -> None:
         homography = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) @ pose[:3, [0, 1, 3]] @ to_board
         image = cv2.warpPerspective(BOARD.picture(60), homography, SIZE, flags=cv2.INTER_AREA, borderValue=128)
         image = (image + random.normal(0, 3, image.shape)).clip(0, 255).astype(np.uint8)
-        dataset.add_frame({"observation.images.front": np.repeat(image[..., None], 3, axis=2), "task": "board"})
+        image = np.repeat(image[..., None], 3, axis=2)
+        image = image.transpose(2, 0, 1) if channels_first else image
+        dataset.add_frame({"observation.images.front": image, "task": "board"})
     dataset.save_episode()
     dataset.finalize()
 
 
-def test_the_command_finds_them_in_rendered_images(tmp_path):
-    record(tmp_path / "data", 16)
+@pytest.mark.parametrize("channels_first", [False, True])
+def test_the_command_finds_them_in_rendered_images(tmp_path, channels_first):
+    """LeRobot lets a dataset describe its images channels first."""
+    record(tmp_path / "data", 16, channels_first)
     file = tmp_path / "calibration.json"
     arguments = ["calibrate", "camera", "--camera=front", f"--file={file}", "--board=7x5:30:22"]
     with pytest.raises(ValueError, match=r"either --serial of a RealSense, or --dataset.root"):

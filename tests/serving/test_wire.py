@@ -64,6 +64,14 @@ def nested(depth: int) -> bytes:
     return b"\x81\xa1a" * depth + b"\xc0"
 
 
+def rest_after(depth: int, count: int) -> bytes:
+    """Each list begins with the next one, so all are open before the first one's other values are seen."""
+    inner: list = []
+    for _ in range(depth):
+        inner = [inner] + [0] * count
+    return msgpack.packb({"a": inner})
+
+
 HOSTILE = {
     "empty": (b"", "ends within a value"),
     "a number": (b"\x05", "holds a int; expected a map"),
@@ -75,6 +83,7 @@ HOSTILE = {
     "a list of 4 billion": (b"\x81\xa1a\xdd\xff\xff\xff\xff", "more than 4096 values"),
     "a map of 4 billion": (b"\xdf\xff\xff\xff\xff", "more than 4096 values"),
     "a million nothings": (b"\x81\xa1a\xdd" + struct.pack(">I", 10**6) + b"\xc0" * 10**6, "more than 4096 values"),
+    "lists whose rest comes after what is in them": (rest_after(6, 4000), "more than 4096 values"),
     "binary of 4 GiB": (b"\x81\xa1a\xc6\xff\xff\xff\xff" + b"x", "ends within a value"),
     "text of 4 GiB": (b"\x81\xa1a\xdb\xff\xff\xff\xffx", "text has 4294967295 bytes"),
     "long text": (msgpack.packb({"a": "x" * 5000}), "text has 5000 bytes; at most 4096"),

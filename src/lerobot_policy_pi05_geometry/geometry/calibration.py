@@ -121,9 +121,10 @@ def parse_calibration(content: Any, where: str) -> Calibration:
     rigs = {}
     for name, entry in _object(content.get("rigs", {}), where, "rigs").items():
         told = f"Rig '{name}' of {where}"
-        if not name.isdecimal():
+        if not name.isdecimal() or str(int(name)) != name:  # "01" would be another name of rig 1
             raise ValueError(
-                f"{told}: rigs are numbered, as the data's {RIG} has them; give a whole number as its name."
+                f"{told}: rigs are numbered, as the data's {RIG} has them; give a whole number as its name, as 1 and not "
+                "01."
             )
         if not isinstance(entry, dict) or not {"cameras"} <= set(entry) <= {"cameras", "arms"}:
             raise ValueError(f"{told} must be an object with the entries 'cameras' and 'arms'.")

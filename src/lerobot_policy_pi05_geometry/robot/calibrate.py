@@ -17,7 +17,7 @@ from ..geometry.depth import LEROBOT_COUNT
 from ..geometry.keys import depth_key
 from ..geometry.kinematics import Arm, ForwardKinematics, Link, StateJoint, joint_kinds
 from .board import Board, board_pose
-from .dataset_views import find_views
+from .dataset_views import find_views, image_size
 from .hand_eye import HandEye, solve_hand_eye
 from .hand_eye_problem import View
 
@@ -125,7 +125,7 @@ def calibrate_hand_eye(
     kinematics = ForwardKinematics(arm, [link])
     image_key = f"{OBS_IMAGES}.{camera}"
     views = find_views(dataset, image_key, kinematics, board)
-    stream = image_stream(of_camera, camera, dataset.meta.features.get(image_key, {}).get("shape"))
+    stream = image_stream(of_camera, camera, image_size(dataset.meta.features[image_key]))
     check_board_depth(dataset, camera, of_camera, stream, views, board)
     found = solve_hand_eye(
         kinematics, views, board, stream.intrinsics, stream.distortion, wrist, keep_offsets=keep_offsets
@@ -150,8 +150,8 @@ def cameras_on_arm(calibration: Calibration, arm: str, other_than: str) -> list[
     return [name for name in carried if name != other_than]
 
 
-def image_stream(camera: CameraCalibration, name: str, shape: list[int] | None) -> ImageStream:
-    """The stream of a camera's colour images as they are recorded. shape: (height, width, 3) of the dataset's images."""
+def image_stream(camera: CameraCalibration, name: str, size: tuple[int, int] | None) -> ImageStream:
+    """The stream of a camera's colour images as they are recorded. size: (height, width) of the dataset's images."""
     recorded = camera.as_recorded()
     if recorded.color is None and camera.stream == "depth":
         raise ValueError(
@@ -160,16 +160,15 @@ def image_stream(camera: CameraCalibration, name: str, shape: list[int] | None) 
             "streams with `pi05-geometry calibrate camera`, or set its stream to 'color' if depth is aligned to colour."
         )
     if recorded.color is None:
-        intrinsics, distortion, size, apart = recorded.intrinsics, [0.0] * 5, recorded.size, np.eye(4)
+        intrinsics, distortion, known, apart = recorded.intrinsics, [0.0] * 5, recorded.size, np.eye(4)
     else:
         color = recorded.color
-        intrinsics, distortion, size = color.intrinsics, color.distortion, color.size
+        intrinsics, distortion, known = color.intrinsics, color.distortion, color.size
         apart = np.linalg.inv(np.array(color.depth_T_color))
-    if shape is not None and [shape[1], shape[0]] != size:
+    if size is not None and [size[1], size[0]] != known:
         raise ValueError(
-            f"Images of camera '{name}' are {shape[1]} x {shape[0]} pixels, but its calibration holds for {size[0]} x "
-            f"{size[1]}; read it "
-            "again with the size that you record with."
+            f"Images of camera '{name}' are {size[1]} x {size[0]} pixels, but its calibration holds for {known[0]} x "
+            f"{known[1]}; read it again with the size that you record with."
         )
     return ImageStream(intrinsics, distortion, apart)
 

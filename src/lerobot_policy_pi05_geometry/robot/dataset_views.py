@@ -1,5 +1,8 @@
 """Views of a board in a recorded dataset: frames in which the arm stood still, as different from each other as possible."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -69,6 +72,13 @@ def spread_out(values: np.ndarray, among: np.ndarray, count: int) -> list[int]:
         chosen.append(int(among[int(distance.argmax())]))
         distance = np.minimum(distance, np.abs(values[among] - values[chosen[-1]]).max(axis=1))
     return chosen
+
+
+def image_size(feature: Mapping[str, Any]) -> tuple[int, int]:
+    """Height and width of a dataset's image feature, whose `names` say whether its channels come first."""
+    shape, first = feature["shape"], str((feature.get("names") or [""])[0])
+    height, width = shape[1:] if first.startswith("channel") else shape[:2]
+    return height, width
 
 
 def to_pixels(image: torch.Tensor) -> np.ndarray:

@@ -13,7 +13,7 @@ from ..dataset_folder import require_dataset
 from ..geometry.camera import CameraCalibration, ColorStream
 from ..geometry.rigid import identity_rows
 from .board import Board, Detection
-from .dataset_views import to_pixels
+from .dataset_views import image_size, to_pixels
 
 MIN_VIEWS = 10
 MAX_RESIDUAL = 1.5  # pixels
@@ -53,7 +53,7 @@ def read_intrinsics(root: Path, repo_id: str, camera: str, board: Board) -> Intr
     if key not in dataset.meta.camera_keys:
         known = ", ".join(dataset.meta.camera_keys) or "no camera"
         raise ValueError(f"The dataset has no images {key}; it has {known}.")
-    height, width, _ = dataset.meta.features[key]["shape"]
+    height, width = image_size(dataset.meta.features[key])
     frames = np.linspace(0, len(dataset) - 1, min(len(dataset), _CANDIDATES)).round().astype(int)
     seen = (board.detect(to_pixels(dataset[int(frame)][key])) for frame in frames)
     return solve_intrinsics(board, [found for found in seen if found is not None], (width, height))

@@ -88,7 +88,7 @@ def check_frame(frame: bytes, limits: Limits) -> None:
         if position > end:
             raise RequestError("The frame ends within a value.")
         if inside is not None:
-            if seen + inside > limits.values:
+            if seen + sum(open_containers) + inside > limits.values:
                 raise RequestError(f"The frame holds more than {limits.values} values.")
             if len(open_containers) > limits.depth:
                 raise RequestError(f"The frame is nested more than {limits.depth} deep.")
