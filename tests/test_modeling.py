@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import make_policy as lerobot_make_policy
 
 from lerobot_policy_pi05_geometry import MetaworldRgbdEnv
@@ -551,3 +551,32 @@ def test_a_policy_that_is_loaded_in_inference_mode_acts_and_can_be_trained(runne
     torch.testing.assert_close(chunk, policy.predict_action_chunk(make_batch(1), noise=noise), atol=1e-5, rtol=1e-5)
     loaded.train()
     loaded(make_batch(1))[0].backward()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"geometry_frame": "camera"},
+        {"geometry_cameras": ["wrist", "front"]},
+        {"geometry_source": "random"},
+        {"geometry_positions": "parallel"},
+    ],
+    ids=lambda changed: next(iter(changed)),
+)
+def test_what_trained_geometry_means_stays(changed, tmp_path):
+    """A new policy may still be given other geometry; a trained one would misread it."""
+    policy = make_policy()
+    policy.save_pretrained(tmp_path / "new")
+    policy.training_step.fill_(5)
+    policy.save_pretrained(tmp_path / "trained")
+
+    def load(name: str) -> PI05GeometryPolicy:
+        config = PreTrainedConfig.from_pretrained(tmp_path / name)
+        for key, value in changed.items():
+            setattr(config, key, value)
+        return PI05GeometryPolicy.from_pretrained(tmp_path / name, config=config)
+
+    load("new")
+    name = next(iter(changed))
+    with pytest.raises(ValueError, match=rf"was trained with {name}=.*pi05-geometry convert"):
+        load("trained")

@@ -13,6 +13,12 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+# Settings that say what a geometry token means and how the network reads it.
+_MEANING = (
+    "geometry_source", "geometry_frame", "geometry_cameras", "geometry_grid", "geometry_tokens", "geometry_positions",
+    "geometry_time", "geometry_placement",
+)  # fmt: skip
+
 
 def check_choices(config: "PI05GeometryConfig", choices: Mapping[str, tuple[str, ...]]) -> None:
     """Raise ValueError for a setting that is none of its choices."""
@@ -69,6 +75,21 @@ def check_dropout(config: "PI05GeometryConfig") -> None:
     if sum(rates.values()) > 1 + 1e-9:
         told = ", ".join(f"{name} {rate}" for name, rate in rates.items())
         raise ValueError(f"One draw decides what a training sample goes without, so {told} must not exceed 1 together.")
+
+
+def require_trained_geometry(config: "PI05GeometryConfig", saved: "PI05GeometryConfig") -> None:
+    """Raise ValueError if geometry would mean something else to a trained policy than it did in training.
+
+    config: what it is loaded with. saved: what its checkpoint has. Features of Depth Anything 3 are the same computed or stored.
+    """
+    for name in _MEANING:
+        now, then = getattr(config, name), getattr(saved, name)
+        computed = name == "geometry_source" and {now, then} <= {"da3", "features"}
+        if now is not None and now != then and not computed:
+            raise ValueError(
+                f"This policy was trained with {name}={then}, so --policy.{name}={now} would give its geometry tokens another "
+                f"meaning; leave the setting as it is, or begin anew with `pi05-geometry convert CHECKPOINT OUTPUT`."
+            )
 
 
 def refuse_log_gate(config: "PI05GeometryConfig") -> None:

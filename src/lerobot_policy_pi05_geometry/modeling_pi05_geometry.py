@@ -27,7 +27,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from .compat import make_rtc_processor
-from .configuration_checks import refuse_log_gate, rtc_mode, warn_of_random_weights
+from .configuration_checks import refuse_log_gate, require_trained_geometry, rtc_mode, warn_of_random_weights
 from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
 from .data.images import ImageRangeCheck, prepare_images
 from .data.relative_actions import anchor_of, relative_to
@@ -156,14 +156,16 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         }
         require_policy_type(pretrained_name_or_path, cls.name, **hub)
         weights = find_file(pretrained_name_or_path, SAFETENSORS_SINGLE_FILE, **hub)
-        if config is None:
-            config = PreTrainedConfig.from_pretrained(pretrained_name_or_path, **hub)
+        saved = PreTrainedConfig.from_pretrained(pretrained_name_or_path, **hub)
+        config = saved if config is None else config
         live = ("da3", "features") if kwargs.get("dataset_meta") is None else ("da3",)
         if isinstance(config, PI05GeometryConfig) and config.geometry_source in live:
             kwargs["encoder"] = load_da3(config)  # Before init_empty_weights, which would make its parameters empty.
         with init_empty_weights(include_buffers=False):
             policy = cls(config, **kwargs)
         load_strictly(policy, weights)
+        if policy.training_step > 0 and isinstance(saved, PI05GeometryConfig):
+            require_trained_geometry(config, saved)
         policy.to(config.device)
         policy.eval()
         return policy
@@ -315,7 +317,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
 
     def start_episode(self) -> None:
         """Drop the queued actions; the next images and poses are checked, and no camera has been seen."""
-        self._action_queue: deque[Tensor] = deque(maxlen=self.config.n_action_steps)
+        self._action_queue: deque[Tensor] = deque()
         self.image_range.reset()
         if self.geometry is not None:
             self.geometry.reset()
@@ -337,6 +339,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             longest_prompt=config.tokenizer_max_length,
             steps=config.chunk_size,
             action_dim=config.max_action_dim,
+            denoising_steps=config.num_inference_steps,
         )
         warm_up(self.sampler, cast(RunnerName, config.inference_runner), shapes, self.training_step.device)
 
@@ -390,7 +393,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             batch[OBS_LANGUAGE_TOKENS],
             batch[OBS_LANGUAGE_ATTENTION_MASK],
             geometry=geometry,
-            **{"runner": self.config.inference_runner, **kwargs},
+            **{"runner": self.config.inference_runner, "num_steps": self.config.num_inference_steps, **kwargs},
         )
         actions = actions[..., : self.config.action_feature.shape[0]]
         return actions if anchor is None else actions + anchor[:, None].to(actions)

@@ -59,6 +59,15 @@ def test_actions_leave_the_queue_one_by_one_until_it_is_empty():
     assert torch.equal(policy.select_action(other, noise=noise), policy.predict_action_chunk(other, noise=noise)[:, 0])
 
 
+def test_the_numbers_of_steps_may_be_changed_on_a_built_policy():
+    policy, batch, noise = make_policy(n_action_steps=2), make_batch(1), torch.randn(1, CHUNK, 8)
+    three = policy.predict_action_chunk(batch, noise=noise, num_steps=3).clone()
+    policy.config.num_inference_steps, policy.config.n_action_steps = 3, 4
+    assert torch.equal(policy.predict_action_chunk(batch, noise=noise), three)
+    taken = [policy.select_action(batch, noise=noise) for _ in range(4)]
+    assert torch.equal(torch.stack(taken, dim=1), three[:, :4])
+
+
 def test_reset_forgets_the_queue():
     policy, batch, noise = make_policy(), make_batch(2), torch.randn(2, CHUNK, 8)
     first = policy.select_action(batch, noise=noise)

@@ -76,12 +76,13 @@ class GraphRunner(ChunkRunner):
         masks: Tensor,
         noise: Tensor,
         geometry: PendingGeometry | None = None,
+        num_steps: int | None = None,
     ) -> bool:
-        """Whether a chunk of these shapes, with the policy's number of denoising steps and nothing left over, is recorded."""
+        """Whether a chunk of these shapes with nothing left over is recorded; arguments as in a call."""
         more = -tokens.shape[1] % PROMPT_STEP
         observation = Observation(images, img_masks, F.pad(tokens, (0, more)), F.pad(masks, (0, more)))
         previous = self._previous_chunk(noise, None, None, None)
-        return _key(observation, noise, previous, self._settings(noise, None, geometry)) in self.recorded
+        return _key(observation, noise, previous, self._settings(noise, num_steps, geometry)) in self.recorded
 
     def _functions(
         self, observation: Observation, noise: Tensor, previous: Guidance | HardPrefix | None, settings: ChunkSettings

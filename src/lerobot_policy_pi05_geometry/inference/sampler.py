@@ -117,12 +117,17 @@ class ChunkSampler(nn.Module):
         """Whether the runner that is asked for records chunks by the shape of their inputs."""
         return runner != "plain" and self._kind(runner) is GraphRunner
 
-    def prepare(self, runner: RunnerName = "fast") -> str | None:
-        """Build the runner and its modulations, if they are not there. Returns why the plain path serves instead, or None."""
+    def prepare(self, runner: RunnerName = "fast", num_steps: int | None = None) -> str | None:
+        """Build the runner and its modulations, if they are not there. Returns why the plain path serves instead, or None.
+
+        num_steps: denoising steps of a chunk, the network's if None.
+        """
         with self._one_at_a_time:
             reason = "inference_runner=plain" if runner == "plain" else self._unsupported_reason(runner, set())
             if reason is None:
-                self._runners[self._kind(runner)].compute_flow_times(self._network.config.num_inference_steps)
+                self._runners[self._kind(runner)].compute_flow_times(
+                    num_steps or self._network.config.num_inference_steps
+                )
         return reason
 
     def reserve(self, shapes: int) -> None:
@@ -132,10 +137,10 @@ class ChunkSampler(nn.Module):
             if isinstance(built, GraphRunner):
                 built.reserve(shapes)
 
-    def has_recorded(self, *observation: Any, noise: Tensor, geometry: PendingGeometry | None) -> bool:
+    def has_recorded(self, *observation: Any, **inputs: Any) -> bool:
         """Whether a chunk with inputs of these shapes is recorded; arguments as in `GraphRunner.has_recorded`."""
         built = self._runners.get(GraphRunner)
-        return isinstance(built, GraphRunner) and built.has_recorded(*observation, noise, geometry)
+        return isinstance(built, GraphRunner) and built.has_recorded(*observation, **inputs)
 
     def _unsupported_reason(self, runner: RunnerName, given: set[str]) -> str | None:
         """Why the runner cannot compute this chunk, as the rest of a sentence; if it can, None, and the runner is there."""

@@ -17,7 +17,8 @@ from .side_stream import PendingGeometry
 
 class ChunkShapes(NamedTuple):
     """Shapes of a chunk's inputs: images (batch, 3, side, side) of the cameras that are present, geometry (batch, tokens, width),
-    prompts of at most longest_prompt tokens, noise (batch, steps, action_dim). geometry_tokens: 0 without geometry.
+    prompts of at most longest_prompt tokens, noise (batch, steps, action_dim). geometry_tokens: 0 without geometry. The flow is
+    integrated in denoising_steps.
     """
 
     batch: int
@@ -28,6 +29,7 @@ class ChunkShapes(NamedTuple):
     longest_prompt: int
     steps: int
     action_dim: int
+    denoising_steps: int
 
 
 @torch.no_grad()
@@ -36,7 +38,7 @@ def warm_up(sampler: ChunkSampler, runner: RunnerName, shapes: ChunkShapes, devi
 
     Nothing is done where the plain path serves.
     """
-    declined = sampler.prepare(runner) is not None
+    declined = sampler.prepare(runner, shapes.denoising_steps) is not None
     if declined or not sampler.records(runner):
         return
     batch, geometry = shapes.batch, None
@@ -53,8 +55,9 @@ def warm_up(sampler: ChunkSampler, runner: RunnerName, shapes: ChunkShapes, devi
     for length in lengths:
         text = torch.zeros(batch, length, dtype=torch.int64, device=device)
         observation = images, masks, text, torch.ones_like(text, dtype=torch.bool)
-        if not sampler.has_recorded(*observation, noise=noise, geometry=geometry):
-            sampler(*observation, noise=noise, geometry=geometry, runner=runner)
+        inputs = {"noise": noise, "geometry": geometry, "num_steps": shapes.denoising_steps}
+        if not sampler.has_recorded(*observation, **inputs):
+            sampler(*observation, **inputs, runner=runner)
 
 
 def prompt_lengths(longest: int) -> range:
