@@ -21,6 +21,8 @@ from lerobot_policy_pi05_geometry.geometry.keys import RIG
 from lerobot_policy_pi05_geometry.geometry.placed_camera import PlacedCamera
 from lerobot_policy_pi05_geometry.geometry.resolve import resolve
 from lerobot_policy_pi05_geometry.geometry.rigid import FARTHEST, identity_rows
+from lerobot_policy_pi05_geometry.inspect import inspection
+from lerobot_policy_pi05_geometry.robot.link_depth import check_link_depth
 from pi05_geometry_cli import app
 
 from ..entry_points import (
@@ -141,6 +143,37 @@ def test_an_arm_whose_joints_are_other_entries_of_the_state_is_refused(tmp_path)
         resolve(config, meta)
     meta.features = features_with(STATE_NAMES)
     resolve(config, meta)
+
+
+def test_no_picture_and_no_check_of_depth_is_made_with_other_entries_of_the_state(tmp_path, monkeypatch):
+    calibration, folder = Calibration(on_arm(), {"arm": so101_like()}), tmp_path / "meta"
+    folder.mkdir()
+    (folder / "info.json").write_text("{}")
+    write_calibration_file(tmp_path / "calibration.json", calibration)
+
+    class Recorded:
+        """A dataset of which only the features are read."""
+
+        meta = SimpleNamespace(features=features_with(GRIPPER_FIRST), root=tmp_path)
+
+        def __init__(self, *_, **__) -> None:
+            pass
+
+        def __len__(self) -> int:
+            return 1
+
+    config = SimpleNamespace(depth_unit="mm", calibration=calibration.cameras, arms=calibration.arms, rigs={})
+    monkeypatch.setattr("lerobot.datasets.lerobot_dataset.LeRobotDataset", Recorded)
+    monkeypatch.setattr(inspection, "LeRobotDataset", Recorded)
+    monkeypatch.setattr(inspection, "load_policy", lambda *_: SimpleNamespace(policy=SimpleNamespace(config=config)))
+    scene = ["scene", f"--dataset.root={tmp_path}", f"--file={tmp_path / 'calibration.json'}"]
+    for call in (
+        lambda: CliRunner().invoke(app, scene, catch_exceptions=False),
+        lambda: inspection.write_inspection("checkpoint", tmp_path, "local/data", 0, "cpu", tmp_path / "page.html"),
+        lambda: check_link_depth(Recorded(), calibration, "wrist", "arm", tmp_path / "arm.urdf"),
+    ):
+        with pytest.raises(ValueError, match="is state entry 0"):
+            call()
 
 
 def test_state_entries_are_compared_on_every_rig_and_only_where_they_are_named(tmp_path):

@@ -165,5 +165,7 @@ def test_a_joint_and_an_entry_that_are_given_wrongly_are_refused():
     links = so101_like().links
     with pytest.raises(ValueError, match="has no joint elbow_flexx; it has shoulder_pan, "):
         make_arm(links, STATE_NAMES, {"elbow_flexx": "elbow_flex.pos"})
+    with pytest.raises(ValueError, match="--unit names gripper, for which the state has no entry"):
+        make_arm(links, STATE_NAMES[:5], units={"gripper": "radians"})
     with pytest.raises(ValueError, match=r"'wrist_flex\.pos' is given to two joints, elbow_flex and wrist_flex"):
         make_arm(links, STATE_NAMES, {"elbow_flex": "wrist_flex.pos"})

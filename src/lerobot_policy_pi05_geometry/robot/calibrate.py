@@ -62,6 +62,9 @@ def make_arm(
                 )
             metres = kind == "prismatic" and unit in ("degrees", "radians")
             joints.append(StateJoint(joint, entry, names.index(entry), units.get(joint, "metres" if metres else unit)))
+    without = sorted(set(units) - {joint.joint for joint in joints})
+    if joints and without:
+        raise ValueError(f"--unit names {', '.join(without)}, for which the state has no entry; say it with --joint.")
     if not joints:
         raise ValueError(
             f"No joint of the link file has the name of a state entry ({', '.join(names)}); say which is which with "

@@ -13,9 +13,8 @@ from .board import Board
 from .hand_eye_problem import View
 from .joint_offsets import levers
 
-STILL = np.radians(
-    0.6
-)  # a joint's motion over `WINDOW` frames: more (1 mm of a lift), and image and state are of different poses
+# A joint's motion over `WINDOW` frames (1 mm of a lift): more, and image and state are of different poses.
+STILL = np.radians(0.6)
 WINDOW = 2  # frames before and after
 MAX_VIEWS = 120  # the more the better: the noise of the joints leaves an error that falls with their root
 

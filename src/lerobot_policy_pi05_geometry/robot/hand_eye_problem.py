@@ -23,9 +23,8 @@ from .joint_offsets import levers, tellable
 
 PIXEL_NOISE = 0.5  # pixels: of a corner that OpenCV has found
 _STEP = 1e-6  # radians and metres, of numerical derivatives
-JOINT_NOISE = np.radians(
-    0.2
-)  # radians: backlash and resolution of a hobby servo; 0.35 mm of a prismatic joint (`levers`)
+# Radians: backlash and resolution of a hobby servo. A prismatic joint has 0.35 mm of it (`levers`).
+JOINT_NOISE = np.radians(0.2)
 
 
 @dataclass(frozen=True)
