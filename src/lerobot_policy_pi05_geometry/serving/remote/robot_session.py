@@ -15,6 +15,10 @@ from ..inputs import GUIDANCE_KEYS
 logger = logging.getLogger(__name__)
 
 _PAUSE = 0.2  # seconds between two attempts to connect
+# Entries of a server's metadata that say what its policy reads and gives.
+_OF_THE_POLICY = (
+    "policy", "chunk_size", "n_action_steps", "action_dim", "action_names", "inputs", "depth_unit", "rigs", "default_rig",
+)  # fmt: skip
 
 
 class RobotSession:
@@ -112,8 +116,11 @@ class RobotSession:
 
 
 def require_same_policy(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise ValueError unless two metadata describe one policy. They name their sessions, which differ."""
-    changed = [key for key in {**before, **now} if key != "session" and before.get(key) != now.get(key)]
+    """Raise ValueError unless two metadata describe policies that read and give the same.
+
+    The session, the server's version and its seed may differ.
+    """
+    changed = [key for key in _OF_THE_POLICY if before.get(key) != now.get(key)]
     if changed:
         told = ", ".join(_change(key, before, now) for key in changed)
         raise ValueError(
