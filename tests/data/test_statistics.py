@@ -319,3 +319,37 @@ def test_a_gripper_that_hardly_moves_is_refused_until_it_has_its_whole_range(dat
 def test_a_dimension_that_is_not_there_is_named(dataset, key, dims, told):
     with pytest.raises(ValueError, match=told):
         write_frame_quantiles(dataset, REPO_ID, (), {key: dims})
+
+
+def with_states(root, change):
+    """Change the states in the dataset's files. change: of all frames, (N, D) float32."""
+    for path in (root / "data").rglob("*.parquet"):
+        table = parquet.read_table(path)
+        number, field = table.schema.get_field_index(STATE), table.schema.field(STATE)
+        states = np.stack(table[STATE].to_pylist()).astype(np.float32)
+        change(states)
+        parquet.write_table(table.set_column(number, field, pyarrow.array(states.tolist(), type=field.type)), path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_value_that_is_not_finite_leaves_the_quantiles_alone(dataset, value):
+    stored = (dataset / "meta" / "stats.json").read_text()
+    with_states(dataset, lambda states: states.__setitem__((3, 2), value))
+    with pytest.raises(ValueError, match=rf"observation.state\[2\] is {value} in frame 3"):
+        write_frame_quantiles(dataset, REPO_ID)
+    assert (dataset / "meta" / "stats.json").read_text() == stored
+
+
+def test_the_quantiles_of_a_constant_are_the_constant(dataset, caplog):
+    """Rounding would give them a width, and the state would fill it."""
+    constants = np.array([0.3, 0.0, 1000.0], np.float32)
+    with_states(dataset, lambda states: states.__setitem__((slice(None), slice(2, 5)), constants))
+    write_frame_quantiles(dataset, REPO_ID)
+    stats = metadata(dataset).stats[STATE]
+    for name in ("q01", "q10", "q50", "q90", "q99"):
+        assert np.array_equal(stats[name][2:5], constants.astype(np.float64)), name
+    config = make_config(geometry_source="none", input_features={STATE: make_features()[0][STATE]})
+    config.validate_features()
+    check_stats(config, metadata(dataset).stats)
+    for dim in (2, 3, 4):
+        assert f"{STATE}[{dim}] is constant" in caplog.text

@@ -34,7 +34,8 @@ def write_frame_quantiles(
     full_range: dimensions of features whose quantiles become their minimum and maximum, for a dimension that hardly moves.
     Returns, per feature, the share of min..max that q01..q99 covered before and covers now, (2, D).
     Raises FileNotFoundError if there is no dataset at `root`, ValueError if its action statistics are of relative actions
-    and `keys` names actions, or `full_range` names what is not there.
+    and `keys` names actions, a frame has a value that is not finite, or `full_range` names what is not there. Then nothing is
+    written.
     """
     root = Path(root)
     meta = LeRobotDatasetMetadata(repo_id, root=require_dataset(root))
@@ -52,7 +53,8 @@ def write_frame_quantiles(
         if key in meta.features:
             column = table.to_table(columns=[key])[key].to_numpy()
             frames = np.stack(column).astype(np.float64).reshape(len(column), -1)  # (frames, D)
-            stats[key] = {**stats.get(key, {}), **get_feature_stats(frames, axis=0, keepdims=False)}
+            _require_finite(key, frames)
+            stats[key] = {**stats.get(key, {}), **_frame_stats(frames)}
             changed.append(key)
     for key, dims in (full_range or {}).items():
         stats[key] = _with_full_range(key, stats, dims)
@@ -63,6 +65,26 @@ def write_frame_quantiles(
         if "q01" in before.get(key, {})
         else covered(stats[key])[None]
         for key in dict.fromkeys(changed)
+    }
+
+
+def _require_finite(key: str, frames: np.ndarray) -> None:
+    bad = np.argwhere(~np.isfinite(frames))
+    if len(bad):
+        frame, dim = bad[0]
+        raise ValueError(
+            f"{key}[{dim}] is {frames[frame, dim]} in frame {frame}, so it has no quantiles; correct the frame or leave out its "
+            "episode (`lerobot-edit-dataset`). The statistics stay as they are."
+        )
+
+
+def _frame_stats(frames: np.ndarray) -> dict[str, np.ndarray]:
+    """LeRobot's statistics of (frames, D); of a constant dimension all quantiles are the constant, without rounding."""
+    found = get_feature_stats(frames, axis=0, keepdims=False)
+    constant = found["min"] == found["max"]
+    return {
+        name: np.where(constant, found["min"], value) if name.startswith("q") else value
+        for name, value in found.items()
     }
 
 
