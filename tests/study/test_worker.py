@@ -1,5 +1,6 @@
 """A worker's life, and what is read of its log."""
 
+import json
 import os
 import select
 import time
@@ -7,8 +8,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from lerobot_policy_pi05_geometry.study.launch import Job
-from lerobot_policy_pi05_geometry.study.training_log import TrainingCurve
+from lerobot_policy_pi05_geometry.study.launch import Job, _record_crash
+from lerobot_policy_pi05_geometry.study.training_log import TrainingCurve, read_curve
 from lerobot_policy_pi05_geometry.study.worker import end_with_parent
 
 
@@ -51,3 +52,21 @@ def test_only_a_whole_line_of_progress_counts(tmp_path):
         file.write("10\n    for done, _ in progress:\n  File 'progress: a/b'\n")
     job.read_log()
     assert (job.stage, job.done, job.total) == ("record libero_goal/8-near", 4, 10)
+
+
+def test_a_torn_character_in_a_log_disturbs_nothing(tmp_path):
+    """Half of it is written when the log is read, or a library writes in another encoding."""
+    log = tmp_path / "run.log"
+    run = SimpleNamespace(log=log, steps=10, crash=tmp_path / "crashed.json")
+    job = Job(run, SimpleNamespace(returncode=1), 0, TrainingCurve(1))
+    first, second = "progress: record π 3/10\n".encode(), "progress: record π 4/10\n".encode()
+    torn = first + second[: second.index("π".encode()) + 1]
+    log.write_bytes(torn)
+    job.read_log()
+    assert (job.stage, job.done) == ("record π", 3)
+    log.write_bytes(first + second + b"caf\xe9\nprogress: record 5/10\n")
+    job.read_log()
+    assert (job.stage, job.done, job.log_position) == ("record", 5, log.stat().st_size)
+    _record_crash(job)
+    assert "record 5/10" in json.loads(run.crash.read_text())["log_end"]
+    assert read_curve(log, 1) == {"step": [], "loss": []}

@@ -42,12 +42,12 @@ class Job:
 
     def read_log(self) -> None:
         """Update the progress from the lines that the process has logged since the last call."""
-        with self.run.log.open() as log:
+        with self.run.log.open("rb") as log:  # positions are of bytes, and a character may be half written
             log.seek(self.log_position)
-            text = log.read()
-        complete = text[: text.rfind("\n") + 1]
-        self.log_position += len(complete.encode())
-        for line in complete.splitlines():
+            content = log.read()
+        complete = content[: content.rfind(b"\n") + 1]
+        self.log_position += len(complete)
+        for line in complete.decode("utf-8", errors="replace").splitlines():
             if self.curve.add(line):
                 self.stage, self.done, self.total = "train", self.curve.steps[-1], self.run.steps
             elif (told := _PROGRESS.search(line)) is not None:
@@ -146,7 +146,7 @@ def _start(run: Run, threads: int) -> Job:
 def _record_crash(job: Job) -> None:
     if job.process.returncode == 0:
         return
-    log_end = job.run.log.read_text()[-_CRASH_LOG_CHARACTERS:]
+    log_end = job.run.log.read_text(encoding="utf-8", errors="replace")[-_CRASH_LOG_CHARACTERS:]
     job.run.crash.write_text(json.dumps({"exit_code": job.process.returncode, "log_end": log_end}, indent=2))
 
 

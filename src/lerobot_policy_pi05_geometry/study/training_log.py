@@ -40,6 +40,6 @@ class TrainingCurve:
 def read_curve(log: Path, every: int) -> dict[str, list]:
     """Training loss of a run from its log. every: steps between two lines."""
     curve = TrainingCurve(every)
-    for line in log.read_text().splitlines():
+    for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
         curve.add(line)
     return {"step": curve.steps, "loss": curve.losses}
