@@ -5,8 +5,18 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
 from lerobot_policy_pi05_geometry.checkpoint.load import LoadedPolicy
+from lerobot_policy_pi05_geometry.geometry.camera import Mount
 from lerobot_policy_pi05_geometry.inspect.bench import PARTS, STEPS, bench, random_observation
-from tests.entry_points import CHUNK, make_calibration, make_features, make_observation, make_policy, make_processors
+from tests.entry_points import (
+    CHUNK,
+    WRIST_POSE,
+    make_calibration,
+    make_config,
+    make_features,
+    make_observation,
+    make_policy,
+    make_processors,
+)
 from tests.serving.running import make_rigs
 
 
@@ -85,3 +95,18 @@ def test_depth_is_1_m_whatever_its_scale():
     calibration["front"].depth_scale = 1e-5
     loaded = load(calibration=calibration)
     assert bench(loaded, random_observation(loaded.policy.config), 1).chunk.p50 > 0
+
+
+def test_the_pose_of_a_camera_on_an_arm_is_not_made_up():
+    """Then the arm's kinematics would not be run, and not be timed."""
+    calibration, (inputs, _) = make_calibration(), make_features()
+    inputs.pop(WRIST_POSE)
+
+    def made_up():
+        config = make_config(calibration=calibration, input_features=dict(inputs))
+        config.validate_features()
+        return random_observation(config)
+
+    assert WRIST_POSE in made_up()
+    calibration["wrist"].mount = Mount("arm", "gripper", torch.eye(4).tolist())
+    assert WRIST_POSE not in made_up()

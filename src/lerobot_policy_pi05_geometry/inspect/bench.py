@@ -82,7 +82,9 @@ def random_observation(config: PI05GeometryConfig, task: str = "do the task") ->
         elif key == OBS_STATE:
             observation[key] = torch.zeros(shape)
     for camera, calibration in config.calibration.items():
-        if calibration.extrinsics is None and find_depth_key(camera, observation, config.depth_keys) is not None:
+        if calibration.extrinsics is not None or calibration.mount is not None:
+            continue  # its pose is known, or computed from the state, which is timed too
+        if find_depth_key(camera, observation, config.depth_keys) is not None:
             observation.setdefault(extrinsics_key(camera), torch.eye(4)[None])
     return observation
 
