@@ -57,6 +57,26 @@ def test_a_folder_without_a_dataset(arguments, tmp_path, monkeypatch):
     assert "holds no LeRobotDataset (meta/info.json is missing)" in str(result.exception)
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["record", "--output", "data", "--episodes", "0"],
+        ["record", "--output", "data", "--image-size", "0"],
+        ["evaluate", "checkpoint", "--episodes", "0"],
+        ["libero-replay", "source", "data", "--image-size", "0"],
+        ["precompute", "--batch-size", "0"],
+        ["study", "--workers", "0", "--dataset.root", "data"],
+    ],
+    ids=lambda arguments: " ".join(arguments),
+)
+def test_a_number_of_nothing_is_refused(arguments, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert "equal to 1" in result.output
+    assert not folder_contents(tmp_path)
+
+
 @pytest.fixture
 def started(monkeypatch):
     """Nothing is trained: the runs that a study would start, and the command that its report would show."""

@@ -74,16 +74,16 @@ def precompute(
     encoder: Annotated[
         str, typer.Option(help="Depth Anything 3: hub id, folder or safetensors file.")
     ] = "depth-anything/DA3-BASE",
-    grid: Annotated[int, typer.Option(help="Cells per side and camera: the policy's geometry_grid.")] = 8,
+    grid: Annotated[int, typer.Option(help="Cells per side and camera: the policy's geometry_grid.", min=1)] = 8,
     cameras: Annotated[
         str | None, typer.Option(help="Comma-separated, in token order. Default: every RGB camera, sorted.")
     ] = None,
-    image_size: Annotated[int | None, typer.Option(help="Pixels per side: the policy's da3_image_size.")] = None,
+    image_size: Annotated[int | None, typer.Option(help="Pixels per side: the policy's da3_image_size.", min=1)] = None,
     dtype: Annotated[str, typer.Option(help="Compute dtype of the encoder: bfloat16 or float32.")] = "bfloat16",
-    batch_size: Annotated[int, typer.Option(help="Frames per pass of the encoder.")] = 16,
+    batch_size: Annotated[int, typer.Option(help="Frames per pass of the encoder.", min=1)] = 16,
     device: Annotated[str | None, typer.Option(help="Device of the encoder. Default: a GPU if available.")] = None,
     output: Annotated[Path | None, typer.Option(help="Folder of the stores. Default: in the dataset's folder.")] = None,
-    shard_frames: Annotated[int, typer.Option(help="Frames per file.")] = 512,
+    shard_frames: Annotated[int, typer.Option(help="Frames per file.", min=1)] = 512,
     check: Annotated[bool, typer.Option("--verify", help="Verify the checksums of a finished store.")] = False,
 ) -> None:
     """Compute Depth Anything 3's features of every frame once, for training with geometry_source=features.

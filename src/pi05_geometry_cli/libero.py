@@ -20,9 +20,9 @@ def libero_replay(
     files: Annotated[list[Path], typer.Argument(help="LIBERO's original <task>_demo.hdf5 files.")],
     output: Output,
     cameras: LiberoCameras = "fixed",
-    image_size: Annotated[int, typer.Option(help="Pixels per side of RGB and depth.")] = 256,
+    image_size: Annotated[int, typer.Option(help="Pixels per side of RGB and depth.", min=1)] = 256,
     rendering: Rendering = "full",
-    limit: Annotated[int | None, typer.Option(help="Demonstrations of each file; none is all.")] = None,
+    limit: Annotated[int | None, typer.Option(help="Demonstrations of each file; none is all.", min=1)] = None,
 ) -> None:
     """Render LIBERO's original demonstrations anew, with depth and calibration, into a LeRobotDataset v3."""
     from lerobot_policy_pi05_geometry.sim.libero.replay import replay

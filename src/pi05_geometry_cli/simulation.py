@@ -15,9 +15,9 @@ from .libero import Placement, Rendering, TaskIds
 def record(
     output: Output,
     task: Task = "button-press-topdown-wide",
-    episodes: Annotated[int, typer.Option(help="Successful expert episodes to record, of each task.")] = 100,
+    episodes: Annotated[int, typer.Option(help="Successful expert episodes to record, of each task.", min=1)] = 100,
     cameras: Annotated[str, typer.Option(help="Range of camera poses, of the environment's own ranges.")] = "train",
-    image_size: Annotated[int, typer.Option(help="Pixels per side of RGB and depth.")] = 84,
+    image_size: Annotated[int, typer.Option(help="Pixels per side of RGB and depth.", min=1)] = 84,
     seed: Annotated[int, typer.Option(help="Selects the recorded episodes.")] = 0,
     env: Annotated[
         str, typer.Option(help="metaworld_rgbd, or libero_rgbd with --task as its suite.")
@@ -75,9 +75,9 @@ def evaluate(
     task: Task = "button-press-topdown-wide",
     cameras: Cameras = "train",
     sensor: Sensor = "ideal",
-    episodes: Annotated[int, typer.Option(help="Episodes to run.")] = 50,
+    episodes: Annotated[int, typer.Option(help="Episodes to run.", min=1)] = 50,
     first_seed: Annotated[int, typer.Option(help="Seed of the first episode; the next ones count up.")] = 0,
-    image_size: Annotated[int, typer.Option(help="Pixels per side, as in training.")] = 84,
+    image_size: Annotated[int, typer.Option(help="Pixels per side, as in training.", min=1)] = 84,
     device: Annotated[str, typer.Option(help="Where the policy runs.")] = "cpu",
     output: Annotated[Path | None, typer.Option(help="JSON file for the outcome of every episode.")] = None,
 ) -> None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lerobot_policy_pi05_geometry.study.launch import Progress as StudyProgress
     from lerobot_policy_pi05_geometry.study.runs import Run
 
-Workers = Annotated[int | None, typer.Option(help="Runs at once. Default: one per core.")]
+Workers = Annotated[int | None, typer.Option(help="Runs at once. Default: one per core.", min=1)]
 
 
 @app.command()
