@@ -46,7 +46,7 @@ def mode_of(rtc: RTCConfig | None) -> str | None:
 
 def rtc_config_of(mode: str) -> RTCConfig:
     """LeRobot's default real-time chunking in a mode, "guided" or "trained", which 0.6.1's RTCConfig cannot say."""
-    return RTCConfig(mode=mode) if "mode" in RTCConfig.__dataclass_fields__ else RTCConfig()  # type: ignore[call-arg]
+    return RTCConfig(mode=mode) if "mode" in RTCConfig.__dataclass_fields__ else RTCConfig()
 
 
 def make_rtc_processor(rtc: RTCConfig, trained: bool) -> RTCProcessor:

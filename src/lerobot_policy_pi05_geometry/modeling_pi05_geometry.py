@@ -31,7 +31,7 @@ from .configuration_checks import refuse_log_gate, require_trained_geometry, rtc
 from .configuration_pi05_geometry import EMPTY_CAMERA, PI05GeometryConfig
 from .data.images import ImageRangeCheck, prepare_images
 from .data.relative_actions import anchor_of, relative_to
-from .data.rtc import without_padding
+from .data.rtc import HardPrefixLength, without_padding
 from .data.small_tokenizer import SMALL_TOKENIZER, small_number_ids
 from .data.statistics import check_stats, require_matching_kind
 from .data.training_batch import check_actions, require_finite_losses, valid_steps
@@ -47,7 +47,7 @@ from .model import PI05Pytorch
 from .model.config import RunnerName
 from .model.flow_matching import FlowDraw, draw_flow
 from .model.segments import GeometryTokens
-from .training.dropout import Cameras, drop
+from .training.dropout import Cameras, check_camera_names, drop
 from .training.geometry_log import GeometryLog
 from .training.lora import always_in_full, peft_targets
 from .training.micro_batches import in_micro_batches, rows_of
@@ -97,6 +97,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         source, changes = resolve(config, dataset_meta, encoder)
         config.record(changes)
         self.geometry = None if source is None else GeometryEncoder(source, self.model.geometry_width)
+        check_camera_names(self._cameras(), config.dropout_rates)
         if config.tokenizer == SMALL_TOKENIZER and not self.model.action_in_proj.weight.is_meta:
             self.model.paligemma_with_expert.language_model.initialise_number_embeddings(small_number_ids())
         self._set_trainable()
@@ -107,7 +108,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         self.progress = TrainingProgress()
         self._acted_on = 0  # rows of the last observation; 0 before the first
         self._present: tuple[bool, ...] = ()  # which cameras it had an image of
-        self._told_of_delay = False
+        self._hard_prefix_length = HardPrefixLength(config.rtc_training_max_delay)
         self._noise_seed = torch.initial_seed()
         tokens = 0 if self.geometry is None else self.geometry.source.num_tokens
         self.geometry_log = GeometryLog(self.model.paligemma_with_expert, tokens)
@@ -378,7 +379,8 @@ class PI05GeometryPolicy(PreTrainedPolicy):
                 and self.model.rtc_mode == "trained"
                 and kwargs["prev_chunk_left_over"] is not None
             ):
-                kwargs["inference_delay"] = self._hard_prefix_length(**kwargs)
+                steps = kwargs["prev_chunk_left_over"].shape[-2]
+                kwargs["inference_delay"] = self._hard_prefix_length(kwargs.get("inference_delay"), steps)
         anchor = anchor_of(batch, self.config.use_relative_actions)  # (B, A)
         if anchor is not None and kwargs.get("prev_chunk_left_over") is not None:
             kwargs["prev_chunk_left_over"] = relative_to(anchor, kwargs["prev_chunk_left_over"])
@@ -397,25 +399,6 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         )
         actions = actions[..., : self.config.action_feature.shape[0]]
         return actions if anchor is None else actions + anchor[:, None].to(actions)
-
-    def _hard_prefix_length(
-        self, prev_chunk_left_over: Tensor, inference_delay: int | None = None, **_: Any
-    ) -> int | None:
-        """The delay, or fewer steps, if training knew only shorter prefixes or fewer are left. Warns once.
-
-        LeRobot gives the longest delay that it has ever met, so one slow chunk must not end real-time chunking.
-        """
-        longest = min(self.config.rtc_training_max_delay, prev_chunk_left_over.shape[-2])
-        if inference_delay is None or inference_delay <= longest:
-            return inference_delay
-        if not self._told_of_delay:
-            logger.warning(
-                "inference_delay is %d, but only %d steps can be given to this chunk (rtc_training_max_delay=%d, %d steps left "
-                "over); those are. Where chunks are late again and again, act at a lower rate or use rtc_mode=guided.",
-                inference_delay, longest, self.config.rtc_training_max_delay, prev_chunk_left_over.shape[-2],
-            )  # fmt: skip
-        self._told_of_delay = True
-        return longest
 
     def _measure(self, batch: dict[str, Tensor]) -> GeometryTokens:
         assert self.geometry is not None

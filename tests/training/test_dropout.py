@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from lerobot_policy_pi05_geometry.model.flow_matching import FlowDraw
 from lerobot_policy_pi05_geometry.training.dropout import Cameras, DropoutRates, drop
 
-from ..entry_points import FRONT, FRONT_DEPTH, WRIST, WRIST_DEPTH, make_batch, make_policy
+from ..entry_points import FRONT, FRONT_DEPTH, WRIST, WRIST_DEPTH, make_batch, make_features, make_policy
 
 CELLS = 4
 NAMES = ("front", "wrist", "left", "right")
@@ -168,3 +168,13 @@ def test_a_policy_without_geometry_keeps_its_images() -> None:
     plain.load_state_dict(policy.state_dict())
     batch = make_batch(2)
     assert torch.equal(policy.forward(batch)[0], plain.forward(batch)[0])
+
+
+def test_a_camera_whose_image_has_another_name_cannot_be_taken_away() -> None:
+    """As after a --rename_map of the images: the depth camera would stay when its image goes."""
+    features, _ = make_features()
+    renamed = {FRONT: "observation.images.base", WRIST: "observation.images.hand"}
+    changes = {"input_features": {renamed.get(key, key): value for key, value in features.items()}}
+    make_policy(**changes)
+    with pytest.raises(ValueError, match=r"no image \(base, hand\) has the name of a geometry camera \(front, wrist\)"):
+        make_policy(**changes, camera_dropout=0.1)

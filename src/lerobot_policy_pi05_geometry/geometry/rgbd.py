@@ -85,7 +85,8 @@ class RgbdSource(GeometrySource):
             need = f" (and, for a camera without extrinsics in its calibration, {poses})"
         return (
             f"The observation has no depth from camera(s) {', '.join(cameras)}: expected {keys}{need}; connect the depth camera, "
-            "rename its key with --rename_map, name it in --policy.optional_depth_cameras if it may be missing, or train with "
+            "give its key this name (in training, leave depth out of --rename_map), name it in "
+            "--policy.optional_depth_cameras if it may be missing, or train with "
             "--policy.geometry_source=none."
         )
 

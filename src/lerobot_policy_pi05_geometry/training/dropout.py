@@ -44,6 +44,16 @@ class Cameras(NamedTuple):
     across_views: bool
 
 
+def check_camera_names(cameras: Cameras, rates: DropoutRates) -> None:
+    """Raise ValueError if a camera is to be taken away, image and geometry, and no image has the name of a geometry camera."""
+    if rates.camera and cameras.images and cameras.geometry and not set(cameras.images) & set(cameras.geometry):
+        raise ValueError(
+            f"camera_dropout takes away a camera's image and its geometry, but no image ({', '.join(cameras.images)}) has the "
+            f"name of a geometry camera ({', '.join(cameras.geometry)}), as after a --rename_map of the images; rename the "
+            "cameras in the dataset, or set --policy.camera_dropout=0."
+        )
+
+
 def drop(
     draw: FlowDraw, rates: DropoutRates, cameras: Cameras, img_masks: Sequence[Tensor], geom_pad: Tensor | None
 ) -> tuple[list[Tensor], Tensor | None]:
