@@ -177,6 +177,25 @@ def test_a_policy_that_has_its_cameras_keeps_them():
     assert config.depth_keys == {}
 
 
+def test_a_converted_checkpoint_takes_no_colourised_depth_for_depth():
+    """It learns its depth cameras from the data."""
+    features = {
+        "observation.images.front_depth": {
+            "dtype": "video",
+            "shape": (28, 28, 3),
+            "names": ["height", "width", "channels"],
+        },
+        "observation.images.wrist_depth": {
+            "dtype": "image",
+            "shape": (28, 28, 1),
+            "names": ["height", "width", "channels"],
+        },
+    }
+    config = make_config(input_features={}, geometry_pending=1)
+    config.set_dataset_feature_metadata(features)
+    assert list(config.geometry_features) == ["observation.images.wrist_depth"]
+
+
 def test_a_colourised_depth_video_stays_an_rgb_camera():
     config = found_in({FRONT_DEPTH: rgb_feature(), WRIST_DEPTH: depth_feature("is_depth_map")})
     assert set(config.image_features) == {FRONT_DEPTH}

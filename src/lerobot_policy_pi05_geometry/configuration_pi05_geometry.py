@@ -273,7 +273,8 @@ class PI05GeometryConfig(AblationSettings, PreTrainedConfig):
         self.depth_keys = find_depth_keys(features, self.depth_keys)
         if self.geometry_pending:
             geometry = {key: feature for key, feature in features.items() if is_geometry_key(key, self.depth_keys)}
-            self.geometry_features = dataset_to_policy_features(geometry)
+            found = dataset_to_policy_features(geometry)
+            self.geometry_features = {key: feature for key, feature in found.items() if not _is_rgb(key, feature)}
 
     def validate_features(self) -> None:
         """Complete the features, and move depth, calibration and cameras that may be absent out of `input_features`.
