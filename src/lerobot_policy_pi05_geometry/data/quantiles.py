@@ -141,9 +141,12 @@ def _range_of_actions(root: Path) -> tuple[np.ndarray, np.ndarray] | None:
                 for batch in table.to_batches(columns=list(dict.fromkeys(columns)))
                 if len(batch)
             ]
-            low = np.min([lows.reshape(len(lows), -1).min(axis=0) for lows, _ in rows], axis=0)
-            high = np.max([highs.reshape(len(highs), -1).max(axis=0) for _, highs in rows], axis=0)
-            return low, high
+            lows, highs = (
+                np.concatenate([r.reshape(len(r), -1) for r in of_name]) for of_name in zip(*rows, strict=True)
+            )
+            # Training names a frame that is no number; here it says nothing.
+            known = np.isfinite(lows).all(axis=1) & np.isfinite(highs).all(axis=1)
+            return (lows[known].min(axis=0), highs[known].max(axis=0)) if known.any() else None
     return None
 
 
