@@ -6,6 +6,7 @@
    rigs                 which robot a request is of, where the checkpoint knows several
    inputs               a request in either spelling of keys -> a checked observation
    noise                the noise of a request, a function of session and request
+   renaming             checkpoints that were trained with a `rename_map`
    session              what the server keeps of one robot
    engine               observations of a batch -> action chunks
    worker               the one thread that runs the engine, and the queue before it
