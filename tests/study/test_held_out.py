@@ -99,6 +99,8 @@ def test_what_cannot_be_studied_is_named(root, tmp_path):
         runs(folder=tmp_path)
     with pytest.raises(ValueError, match="only the simulator has"):
         runs(arms=("rgb-wide",))
+    with pytest.raises(ValueError, match="goes on from a policy of arm 'rgb'"):
+        runs(arms=("rgb", "geometry-after-rgb"))
     with pytest.raises(ValueError, match="between 0 and 1"):
         runs(held_out=1.0)
     with pytest.raises(ValueError, match="--seeds must name at least one of them, and each once, got 0, 0"):

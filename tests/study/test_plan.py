@@ -1,13 +1,14 @@
 """Phases of a study, its stop rule, its report and its estimate, on outcomes that are made up: nothing is trained."""
 
 import dataclasses
+import json
 from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
-from lerobot_policy_pi05_geometry.study import adapted, simulated
+from lerobot_policy_pi05_geometry.study import adapted, growth_report, simulated
 from lerobot_policy_pi05_geometry.study.adapted import AdaptedRun
 from lerobot_policy_pi05_geometry.study.conditions import DENOISING_STEPS
 from lerobot_policy_pi05_geometry.study.estimate import Costs, estimate
@@ -75,6 +76,64 @@ def test_phases_follow_each_other_and_only_improving_arms_go_on(tmp_path):
     assert all(run.conditions == ("azimuth-30", "azimuth+0", "azimuth+30") for run in sweep)
     trained = {run.folder for phase in found[:-1] for run in phase.runs}
     assert {run.folder for run in sweep} <= trained  # the sweep evaluates, and trains nothing
+
+
+AFTER_RGB = dataclasses.replace(
+    SPEC,
+    comparisons=(Comparison(TASKS, ("rgb", "geometry", "geometry-after-rgb"), ("inside", "outside", "depth-off")),),
+    sweep=None,
+)
+
+
+def rises(run, condition: str) -> float:
+    return 0.2 if isinstance(run, PretrainingRun) else 0.2 + 0.1 * run.multiple
+
+
+def test_an_arm_after_another_one_has_the_other_half_of_the_steps(tmp_path):
+    """It goes on from the run with half of its multiple, and its own first multiple is 2."""
+    found = executed(tmp_path, AFTER_RGB, rises)
+    folders = {run.folder: run for phase in found[1:] for run in phase.runs}
+    after = [run for run in folders.values() if run.arm_name == "geometry-after-rgb"]
+    assert sorted({run.multiple for run in after}) == [2, 4]
+    for run in after:
+        before = folders[run.before.folder]  # the run of the arm itself, not one more
+        assert (before.arm_name, before.seed, before.task) == ("rgb", run.seed, run.task)
+        assert (before.steps, run.steps) == (run.multiple * 5, run.multiple * 5)
+        assert run.source == before.checkpoint
+        assert simulated.from_json(json.loads(run.to_json())) == run
+    assert len({run.start for run in after if run.task == TASKS[0]}) == 2 * 2  # seeds x multiples
+    twice = dataclasses.replace(after[0], pretraining=dataclasses.replace(SPEC.pretraining, seed=1))
+    assert twice.start != after[0].start
+    steps = Costs(step=1.0, episode=1.0, recording=0.0)
+    assert estimate(AFTER_RGB, tmp_path, steps).most == 0.0
+
+
+def test_an_arm_after_another_one_stops_by_the_same_rule(tmp_path):
+    def rate(run, condition):
+        return 0.5 if isinstance(run, PretrainingRun) or run.arm_name == "geometry-after-rgb" else rises(run, condition)
+
+    spec = dataclasses.replace(AFTER_RGB, growth=Growth((1, 2, 4, 8)))
+    runs = [run for phase in executed(tmp_path, spec, rate)[1:] for run in phase.runs]
+    multiples = {
+        arm: sorted({run.multiple for run in runs if run.arm_name == arm}) for arm in ("rgb", "geometry-after-rgb")
+    }
+    assert multiples == {"rgb": [1, 2, 4, 8], "geometry-after-rgb": [2, 4]}
+
+
+def test_a_curve_stands_at_the_steps_that_it_was_trained_with(tmp_path, monkeypatch):
+    drawn = {}
+    real = growth_report.growth_figure
+    monkeypatch.setattr(
+        growth_report,
+        "growth_figure",
+        lambda titles, steps, arms, floors: drawn.update(arms) or real(titles, steps, arms, floors),
+    )
+    runs = [run for phase in executed(tmp_path, AFTER_RGB, rises) for run in phase.runs]
+    write_growth_report(tmp_path, AFTER_RGB, runs, "pi05-geometry study")
+    assert {arm: list(panels[0]) for arm, panels in drawn.items()} == {
+        "rgb": [10, 20, 40], "geometry": [10, 20, 40], "geometry-after-rgb": [20, 40]
+    }  # fmt: skip
+    assert drawn["geometry-after-rgb"][0][40] == pytest.approx([0.6, 0.6])
 
 
 def test_a_crashed_pretraining_ends_the_study(tmp_path):

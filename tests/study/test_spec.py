@@ -254,6 +254,11 @@ def test_a_warm_start_is_read_and_reaches_the_worker(tmp_path):
         (('arms = ["rgb"]\n', 'arms = ["grid-4"]\n'), "grid-4, which no"),
         (('"outside"]', '"noise"]'), "decides by the conditions inside, outside"),
         (('arms = ["rgb", "geometry"]', 'arms = ["rgb+modulation"]'), "adapts arm 'rgb'"),
+        (('arms = ["rgb", "geometry"]', 'arms = ["geometry-after-rgb"]'), "goes on from arm 'rgb'; name both"),
+        (
+            ('arms = ["rgb", "geometry"]', 'arms = ["rgb", "geometry-after-rgb"]'),
+            "needs two multiples of which one is twice",
+        ),
         (("[growth]", "[growth]\nfactor = 2"), "unknown entries factor"),
         (('["faucet-open-wide"]', '["faucet-open-wide"]\nevaluated = ["reach-v3"]'), "on which it is not trained"),
     ],

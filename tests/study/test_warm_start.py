@@ -98,6 +98,26 @@ def test_an_adapted_arm_trains_nothing_of_its_own(runs):
         untrained.prepare(lambda *_: None)
 
 
+def test_an_arm_goes_on_from_the_policy_of_another_one(runs):
+    """Converted with everything that it has learnt; a run whose first half is missing is refused."""
+    rgb = runs["rgb"]
+    run = dataclasses.replace(rgb, arm_name="geometry-after-rgb", multiple=2)
+    assert (run.before.folder, run.steps) == (rgb.folder, 2)
+    execute(run)
+    first, start = (load_file(folder / "model.safetensors") for folder in (rgb.checkpoint, run.start))
+    assert all(torch.equal(start[name], values) for name, values in first.items() if name != "progress.step")
+    added = start.keys() - first.keys()
+    assert all(name.startswith(("geometry.adapter.", "model.paligemma_with_expert.geometry_gate.")) for name in added)
+    assert added
+    trained = load_file(run.checkpoint / "model.safetensors")
+    assert trained.keys() == start.keys()
+    assert any(not torch.equal(trained[name], start[name]) for name in first)
+    config = PreTrainedConfig.from_pretrained(run.checkpoint)
+    assert (config.geometry_source, config.image_dropout, config.geometry_dropout) == ("rgbd", 0.4, 0.2)
+    with pytest.raises(FileNotFoundError, match=r"goes on from run .*-rgb-0-x2, which has not been trained"):
+        dataclasses.replace(run, multiple=4).prepare(lambda *_: None)
+
+
 @pytest.mark.parametrize("arm", ["grid-4", "pooled"])
 def test_what_defines_new_weights_is_decided_by_the_conversion(arm, runs, tmp_path):
     make_start(runs["pretraining"].pi05, tmp_path / "start", ARMS[arm].options, ("front",), seed=0)

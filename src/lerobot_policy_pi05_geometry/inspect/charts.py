@@ -92,13 +92,13 @@ def horizon_figure(arms: Mapping[str, np.ndarray]) -> Figure:
 def growth_figure(
     panels: Sequence[str],
     steps: Sequence[int],
-    arms: Mapping[str, Sequence[Sequence[Sequence[float]]]],
+    arms: Mapping[str, Sequence[Mapping[int, Sequence[float]]]],
     floors: Sequence[float | None],
 ) -> Figure:
     """Success against training steps, one thin line per training seed and one thick line for their mean.
 
-    panels: titles. steps: training steps of each multiple. arms: per arm and panel, one list per multiple with the success rate
-    of every training seed; an arm that stopped early has fewer multiples. floors: per panel the blind policy's success rate.
+    panels: titles. steps: training steps of each multiple. arms: per arm and panel the success rate of every training seed, by
+    training steps; not every arm has all of them. floors: per panel the blind policy's success rate.
     """
     figure, axes_of = _panels(len(panels), 3.4, 2.9)
     for i, title in enumerate(panels):
@@ -107,10 +107,10 @@ def growth_figure(
         if floor is not None:
             axes.axhline(floor, color=COLOURS["blind"], linestyle=":", label="blind floor" if i == 0 else None)
         for arm, of_panel in arms.items():
-            rates = np.array(of_panel[i])  # (multiples, seeds)
-            if rates.size == 0:
+            if not of_panel[i]:
                 continue
-            x = list(steps[: len(rates)])
+            x, of_steps = zip(*sorted(of_panel[i].items()), strict=True)
+            rates = np.array(of_steps)  # (multiples, seeds)
             colour = COLOURS.get(arm, OTHER)
             axes.plot(x, rates, color=colour, linewidth=0.7, alpha=0.5)
             axes.plot(x, rates.mean(axis=1), color=colour, linewidth=2, marker="o", label=arm if i == 0 else None)

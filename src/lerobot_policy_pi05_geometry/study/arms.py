@@ -18,6 +18,7 @@ class Arm:
     training data. reads: depth, and the camera's pose. A fault of what an arm does not read does not affect it.
     blind: its only input is the state, see `blind_inputs`.
     adapts: the arm whose trained policy is adapted to each condition with one demonstration; None: trained itself.
+    after: the arm that is trained with the first half of the steps; its policy is converted, and trained with the other half.
     """
 
     title: str
@@ -26,6 +27,7 @@ class Arm:
     reads: frozenset[str] = frozenset()
     blind: bool = False
     adapts: str | None = None
+    after: str | None = None
 
 
 def blind_inputs(shape: Sequence[int]) -> dict[str, str]:
@@ -36,9 +38,9 @@ def blind_inputs(shape: Sequence[int]) -> dict[str, str]:
 _DEPTH_AND_POSE = frozenset({DEPTH, POSE})
 
 
-def _geometry(title: str, reads: frozenset[str] = _DEPTH_AND_POSE, **changes: str) -> Arm:
+def _geometry(title: str, reads: frozenset[str] = _DEPTH_AND_POSE, after: str | None = None, **changes: str) -> Arm:
     options = {"geometry_source": "rgbd", **changes}
-    return Arm(title, {f"policy.{name}": value for name, value in options.items()}, reads=reads)
+    return Arm(title, {f"policy.{name}": value for name, value in options.items()}, reads=reads, after=after)
 
 
 # About the faults of the condition "noise", and half of those of "calibration-2" as a standard deviation along each axis.
@@ -59,6 +61,7 @@ ARMS = {
         "RGB only, its visual tokens adapted to each condition with one demonstration", _NO_GEOMETRY, adapts="rgb"
     ),
     "geometry": _geometry("RGB, and a geometry segment from depth: the default"),
+    "geometry-after-rgb": _geometry("RGB only for half of the steps, then geometry for the other half", after="rgb"),
     "random": Arm("RGB, and as many constant random tokens", {"policy.geometry_source": "random"}),
     "prefix": _geometry("geometry among the VLM's own tokens", geometry_placement="prefix"),
     "gate-closed": _geometry("gate started almost shut", geometry_gate_openness="3e-4"),

@@ -114,11 +114,11 @@ def _curves(page: Page, spec: StudySpec, compared: pd.DataFrame, pictures: Path)
     page.heading("Success against training steps")
     panels = [(task, condition) for task in compared["task"].unique() for condition in spec.growth.conditions]
     arms = [arm for arm in ARMS if arm != "blind" and (compared["arm"] == arm).any()]
-    curves = {arm: [_curve(compared, arm, *panel) for panel in panels] for arm in arms}
+    curves = {arm: [_curve(spec, compared, arm, panel) for panel in panels] for arm in arms}
     floors = []
     for panel in panels:
-        of_blind = _curve(compared, "blind", *panel)
-        floors.append(float(np.mean(of_blind[-1])) if of_blind else None)
+        of_blind = _curve(spec, compared, "blind", panel)
+        floors.append(float(np.mean(of_blind[max(of_blind)])) if of_blind else None)
     figure = growth_figure(
         [f"{task}: {condition}" for task, condition in panels],
         [multiple * spec.budget.steps for multiple in spec.growth.multiples],
@@ -129,10 +129,14 @@ def _curves(page: Page, spec: StudySpec, compared: pd.DataFrame, pictures: Path)
     page.row(picture(figure, caption, pictures / "growth.png"))
 
 
-def _curve(table: pd.DataFrame, arm: str, task: str, condition: str) -> list[list[float]]:
-    """Success rate of every training seed, per multiple."""
+def _curve(spec: StudySpec, table: pd.DataFrame, arm: str, panel: tuple[str, str]) -> dict[int, list[float]]:
+    """Success rate of every training seed, by training steps. panel: task and condition."""
+    task, condition = panel
     rows = table[(table["arm"] == arm) & (table["task"] == task) & (table["condition"] == condition)]
-    return [list(success_matrix(of_multiple).mean(axis=1)) for _, of_multiple in rows.groupby("multiple")]
+    return {
+        int(multiple) * spec.budget.steps: list(success_matrix(of_multiple).mean(axis=1))
+        for multiple, of_multiple in rows.groupby("multiple")
+    }
 
 
 def _stop_rule(page: Page, spec: StudySpec, compared: pd.DataFrame) -> None:

@@ -222,6 +222,11 @@ def held_out_runs(
     for name in arms:
         if find_arm(name).cameras != "train" or find_arm(name).adapts is not None:
             raise ValueError(f"Arm '{name}' needs other camera poses in its data, which only the simulator has.")
+        if (first := find_arm(name).after) is not None:
+            raise ValueError(
+                f"Arm '{name}' goes on from a policy of arm '{first}', which a study on your own data does not do; give that "
+                "policy as --pi05, with --arms rgb geometry."
+            )
     split = split_episodes(dataset_root, repo_id, held_out, options)
     if split.untrained:
         logger.warning(

@@ -43,6 +43,7 @@ def runs_of(spec: StudySpec, root: Path, multiple: int = 1) -> list[SimulatedRun
         )
         for seed in spec.seeds
         for (task, arm), conditions in wanted.items()
+        if multiple in spec.growth.multiples_of(arm)
     ]
 
 
@@ -73,7 +74,7 @@ def phases(spec: StudySpec, root: Path) -> Iterator[Phase]:
 
 def continues(arm: str, spec: StudySpec, done: Sequence[SimulatedRun], multiple: int) -> bool:
     """Whether an arm gets this multiple of the steps: it has been trained with all smaller ones and improved with the last."""
-    smaller = [m for m in spec.growth.multiples if m < multiple]
+    smaller = [m for m in spec.growth.multiples_of(arm) if m < multiple]
     if len(smaller) < 2:
         return True
     trained = find_arm(arm).adapts or arm  # an adapted arm follows the arm that it adapts

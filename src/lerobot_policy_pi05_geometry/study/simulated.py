@@ -26,7 +26,8 @@ from .warm_start import make_start, remaining_options
 class SimulatedRun(Run):
     """A task, an arm and a training seed.
 
-    pretraining: the π0.5 to start from; None trains from scratch. multiple: of the budget's steps.
+    pretraining: the π0.5 to start from; None trains from scratch. multiple: of the budget's steps, with those of a run
+    before it.
     """
 
     task: str
@@ -41,7 +42,8 @@ class SimulatedRun(Run):
 
     @property
     def steps(self) -> int:
-        return self.multiple * self.budget.steps
+        earlier = 0 if self.before is None else self.before.multiple
+        return (self.multiple - earlier) * self.budget.steps
 
     @property
     def evaluation_size(self) -> int:
@@ -70,11 +72,27 @@ class SimulatedRun(Run):
         """The pretraining that it starts from, if any."""
         return None if self.pretraining is None else pretraining_run(self.root, self.pretraining, self.budget)
 
+    @cached_property
+    def before(self) -> "SimulatedRun | None":
+        """The run with the first half of the steps, if the arm has one; this run goes on from its policy."""
+        if self.arm.after is None:
+            return None
+        half = self.multiple // 2
+        return SimulatedRun(self.root, self.arm.after, self.seed, (), self.task, self.budget, self.pretraining, half)
+
+    @property
+    def source(self) -> Path | None:
+        """The checkpoint that is converted for it; None if it is trained from scratch."""
+        if self.before is not None:
+            return self.before.checkpoint
+        return None if self.origin is None else self.origin.pi05
+
     @property
     def start(self) -> Path:
-        """The converted checkpoint that it starts from. Runs with other numbers of steps share it."""
-        assert self.origin is not None
-        content = {"origin": self.origin.description(), "options": self.options, "seed": self.seed}
+        """The converted checkpoint that it starts from. Runs with other numbers of steps share it if their source is the same."""
+        origin = self.before or self.origin
+        assert origin is not None
+        content = {"origin": origin.description(), "options": self.options, "seed": self.seed}
         return self.root / "starts" / f"{self.arm_name}-{self.seed}-{short_hash(content)}"
 
     def description(self) -> dict[str, Any]:
@@ -88,6 +106,7 @@ class SimulatedRun(Run):
             "origin": None if self.origin is None else self.origin.description(),
             "data": self.recording.description(),
             "versions": versions(*self.simulated.packages),
+            **({} if self.before is None else {"before": self.before.description()}),
         }
 
     def evaluation_description(self, condition: str) -> dict[str, Any]:
@@ -109,15 +128,17 @@ class SimulatedRun(Run):
 
     def prepare(self, report_progress: ReportProgress) -> None:
         self.recording.make(report_progress)
-        if self.origin is not None:
-            make_start(self.origin.pi05, self.start, self.arm.options, self.simulated.views, self.seed)
+        if self.before is not None and not self.before.checkpoint.exists():
+            raise FileNotFoundError(f"Run {self.name} goes on from run {self.before.name}, which has not been trained.")
+        if self.source is not None:
+            make_start(self.source, self.start, self.arm.options, self.simulated.views, self.seed)
 
     def train(self, output: Path) -> None:
         train_with(self.arguments(output))
 
     def arguments(self, output: Path) -> list[str]:
         """lerobot-train's arguments."""
-        if self.origin is None:
+        if self.source is None:
             begin = {**network_options(self.budget, self.simulated.action_dim), **self.options}
         else:
             begin = {"policy.path": self.start, **remaining_options(self.options)}

@@ -119,6 +119,12 @@ class Growth:
         for name in self.conditions:
             find_condition(name)
 
+    def multiples_of(self, arm: str) -> tuple[int, ...]:
+        """The multiples that an arm can be trained with: all, or for an arm after another one those whose half is trained."""
+        if find_arm(arm).after is None:
+            return self.multiples
+        return tuple(multiple for multiple in self.multiples if multiple / 2 in self.multiples)
+
 
 @dataclass(frozen=True)
 class Sweep:
@@ -167,6 +173,7 @@ class StudySpec:
                 adapted = find_arm(name).adapts
                 if adapted is not None and adapted not in comparison.arms:
                     raise ValueError(f"Arm '{name}' adapts arm '{adapted}'; name both in the same [[compare]] block.")
+                self._check_halves(name, comparison)
             for name in comparison.conditions:
                 find_condition(name)
             if len(self.growth.multiples) > 1 and not set(self.growth.conditions) <= set(comparison.conditions):
@@ -179,6 +186,19 @@ class StudySpec:
         missing = sorted(set(self.sweep.arms) - arms) if self.sweep is not None else []
         if missing:
             raise ValueError(f"[sweep] names {', '.join(missing)}, which no [[compare]] block trains.")
+
+    def _check_halves(self, name: str, comparison: Comparison) -> None:
+        """Raise ValueError for an arm after another one (its first half of the steps) that the study does not train."""
+        first = find_arm(name).after
+        if first is None:
+            return
+        if first not in comparison.arms:
+            raise ValueError(f"Arm '{name}' goes on from arm '{first}'; name both in the same [[compare]] block.")
+        if not self.growth.multiples_of(name):
+            raise ValueError(
+                f"Arm '{name}' has half of its steps from arm '{first}', so it needs two multiples of which one is twice "
+                f"the other, such as multiples = [1, 2] in [growth]; got {list(self.growth.multiples)}."
+            )
 
     def _check_tasks(self) -> None:
         """Raise ValueError for an unknown task or camera range, or tasks that one pretraining cannot serve."""
