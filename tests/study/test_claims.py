@@ -67,6 +67,25 @@ def test_a_rival_that_reaches_geometry_gives_a_factor():
     assert speed_factor(never, "rgb-wide") is None
 
 
+def test_the_policy_that_got_geometry_after_rgb_is_judged_by_its_own_episodes():
+    rates = {
+        ("rgb", "outside"): 0.2, ("rgb", "inside"): 0.7,
+        ("geometry", "outside"): 0.6, ("geometry", "inside"): 0.7, ("geometry", "depth-off"): 0.1,
+        ("geometry-after-rgb", "outside"): 0.3, ("geometry-after-rgb", "inside"): 0.8, ("geometry-after-rgb", "depth-off"): 0.64,
+    }  # fmt: skip
+    table = episodes({(*cell, 2): rate for cell, rate in rates.items()})
+    found = claims(table, table, 1500)
+    assert [claim.verdict for claim in found[:3]] == ["yes", "yes", "no"]
+    of_after = found[-3:]
+    assert [claim.verdict for claim in of_after] == ["no", "yes", "yes"]
+    assert all(claim.claim.startswith("geometry-after-rgb: ") for claim in of_after)
+    assert ["30%" in of_after[0].sentence, "+10 points" in of_after[1].sentence, "64%" in of_after[2].sentence] == [
+        True
+    ] * 3
+    without = table[table["arm"] != "geometry-after-rgb"]
+    assert len(claims(without, without, 1500)) == len(found) - 3
+
+
 @pytest.mark.parametrize("missing", ["geometry", "rgb"])
 def test_what_was_not_run_is_not_claimed(missing):
     table = episodes({(arm, "outside", 1): 0.5 for arm in {"geometry", "rgb"} - {missing}})

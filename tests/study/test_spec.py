@@ -67,6 +67,7 @@ def test_the_default_study_is_the_one_that_was_promised(tmp_path):
         "uniform-times",
         "even-dropout",
         "pooled",
+        "geometry-after-rgb",
     }
     assert max(arms.values(), key=len) == set(ARMS) - of_other_studies
     assert len(arms) >= 3

@@ -6,10 +6,12 @@
 3. With the depth camera off, geometry keeps at least 0.8 of RGB only's success.
 4. RGB trained on the wide range, and RGB with camera rays, do not reach geometry outside. If one does, the claim becomes "learns
    faster", with the factor.
+
+The first three are judged once more for the policy that was trained on RGB only before it got geometry, if the study has it.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -19,6 +21,8 @@ from .statistics import bootstrap
 
 RATIO, INSIDE_MARGIN, DEPTH_OFF_SHARE = 2.0, -0.10, 0.8
 RIVALS = ("rgb-wide", "rgb+rays", "rgb+modulation")
+GEOMETRY, AFTER_RGB = "geometry", "geometry-after-rgb"
+_POLICIES = {GEOMETRY: "the policy with geometry", AFTER_RGB: "the policy that got geometry after RGB"}
 
 
 @dataclass(frozen=True)
@@ -35,48 +39,56 @@ def claims(final: pd.DataFrame, every: pd.DataFrame, steps: int) -> list[Claim]:
 
     final: of each arm's longest training. every: of all trainings. steps: training steps of multiple 1.
     """
-    found = [*_outside(final), *_inside(final), *_depth_off(final)]
+    found = _of_geometry(final, GEOMETRY)
     for rival in RIVALS:
         found += _rival(final, every, rival, steps)
+    if (final["arm"] == AFTER_RGB).any():
+        found += _of_geometry(final, AFTER_RGB)
     return found
 
 
-def _outside(final: pd.DataFrame) -> Iterator[Claim]:
+def _of_geometry(final: pd.DataFrame, arm: str) -> list[Claim]:
+    """The claims about geometry against RGB only. arm: the arm that has geometry."""
+    found = [*_outside(final, arm), *_inside(final, arm), *_depth_off(final, arm)]
+    return found if arm == GEOMETRY else [replace(c, claim=f"{arm}: {c.claim}") for c in found]
+
+
+def _outside(final: pd.DataFrame, arm: str) -> Iterator[Claim]:
     name = "outside the training range, at least twice RGB only's success, intervals apart"
-    rows = on_common_tasks(final, ("geometry", "outside"), ("rgb", "outside"))
+    rows = on_common_tasks(final, (arm, "outside"), ("rgb", "outside"))
     if rows[0].empty:
-        yield Claim(name, "not tested", "The study has no task with geometry and RGB only outside the range.")
+        yield Claim(name, "not tested", f"The study has no task with {arm} and RGB only outside the range.")
         return
     geometry, rgb = map(_pooled, rows)
     apart = geometry[1] > rgb[2]
     holds = apart and geometry[0] >= RATIO * rgb[0]
     sentence = (
-        "With the camera outside the training range, the policy with geometry succeeds in "
+        f"With the camera outside the training range, {_POLICIES[arm]} succeeds in "
         f"{_text(geometry)} of episodes and RGB only in {_text(rgb)}."
     )
     yield Claim(name, "yes" if holds else "no", sentence)
 
 
-def _inside(final: pd.DataFrame) -> Iterator[Claim]:
+def _inside(final: pd.DataFrame, arm: str) -> Iterator[Claim]:
     name = f"inside the training range, lower bound of the difference above {100 * INSIDE_MARGIN:.0f} points"
-    rows = pd.concat(on_common_tasks(final, ("geometry", "inside"), ("rgb", "inside")))
+    rows = pd.concat(on_common_tasks(final, (arm, "inside"), ("rgb", "inside")))
     if rows.empty:
-        yield Claim(name, "not tested", "The study has no task with geometry and RGB only inside the range.")
+        yield Claim(name, "not tested", f"The study has no task with {arm} and RGB only inside the range.")
         return
-    difference, low, high = pooled_difference(rows, "geometry", "rgb")
-    sentence = f"Inside, geometry minus RGB only is {_points(difference, low, high)}."
+    difference, low, high = pooled_difference(rows, arm, "rgb")
+    sentence = f"Inside, {arm} minus RGB only is {_points(difference, low, high)}."
     yield Claim(name, "yes" if low > INSIDE_MARGIN else "no", sentence)
 
 
-def _depth_off(final: pd.DataFrame) -> Iterator[Claim]:
+def _depth_off(final: pd.DataFrame, arm: str) -> Iterator[Claim]:
     name = f"with the depth camera off, at least {DEPTH_OFF_SHARE} of RGB only's success"
-    rows = on_common_tasks(final, ("geometry", "depth-off"), ("rgb", "inside"))
+    rows = on_common_tasks(final, (arm, "depth-off"), ("rgb", "inside"))
     if rows[0].empty:
-        yield Claim(name, "not tested", "The study has no task with geometry's depth camera off and RGB only.")
+        yield Claim(name, "not tested", f"The study has no task with {arm}, its depth camera off, and RGB only.")
         return
     geometry, rgb = map(_pooled, rows)
     holds = geometry[0] >= DEPTH_OFF_SHARE * rgb[0]
-    sentence = f"With the depth camera off, geometry succeeds in {_text(geometry)}, RGB only in {_text(rgb)}."
+    sentence = f"With the depth camera off, {arm} succeeds in {_text(geometry)}, RGB only in {_text(rgb)}."
     yield Claim(name, "yes" if holds else "no", sentence)
 
 
