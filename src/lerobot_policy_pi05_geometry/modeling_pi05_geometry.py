@@ -47,7 +47,7 @@ from .model import PI05Pytorch
 from .model.config import RunnerName
 from .model.flow_matching import FlowDraw, draw_flow
 from .model.segments import GeometryTokens
-from .training.dropout import Cameras, check_camera_names, drop
+from .training.dropout import Cameras, check_camera_names, drop, went_without
 from .training.geometry_log import GeometryLog
 from .training.lora import always_in_full, peft_targets
 from .training.micro_batches import in_micro_batches, rows_of
@@ -226,13 +226,16 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             valid = valid & (torch.arange(steps, device=valid.device) >= delay[:, None])
         count = valid.sum().clamp_min(1)
         seen: list[Tensor] = []
+        without: list[Tensor] = []
 
         def part(rows: slice) -> Tensor:
             """What some rows add to the mean of all, or their losses one by one."""
             flow = FlowDraw(*(drawn[rows] for drawn in draw))
-            losses = self._losses(rows_of(batch, size, rows), flow)[..., :action_dim]
-            losses = losses.masked_fill(~valid[rows][..., None], 0.0)
+            losses, taken = self._losses(rows_of(batch, size, rows), flow)
+            losses = losses[..., :action_dim].masked_fill(~valid[rows][..., None], 0.0)
             seen.append(losses.detach())
+            if taken is not None:
+                without.append(taken)
             if reduction == "none":
                 return losses.sum(dim=(1, 2)) / (valid[rows].sum(dim=1).clamp_min(1) * action_dim)
             return losses.sum() / (count * action_dim)
@@ -245,18 +248,28 @@ class PI05GeometryPolicy(PreTrainedPolicy):
         if not math.isfinite(info["loss"]):
             require_finite_losses(losses, batch)
         info["loss_per_dim"] = (losses.sum(dim=(0, 1)) / count).tolist()
+        if without:
+            of_samples = losses.sum(dim=(1, 2)) / (valid.sum(dim=1).clamp_min(1) * action_dim)
+            self.geometry_log.went_without(of_samples, torch.cat(without))
         info.update(self.geometry_log.numbers())
         return loss, info
 
-    def _losses(self, batch: dict[str, Any], draw: FlowDraw) -> Tensor:
-        """Loss of every action entry (B, S, max_action_dim), the mean over flow samples."""
+    def _losses(self, batch: dict[str, Any], draw: FlowDraw) -> tuple[Tensor, Tensor | None]:
+        """Loss of every action entry (B, S, max_action_dim), the mean over flow samples.
+
+        And (B, 2) bool: the samples from which modality dropout took geometry, and images; None without geometry.
+        """
         device = self.training_step.device
         images, img_masks = prepare_images(batch, self.config, device)
         if self.training and self.config.depth_augmentation:
             batch = {**batch, AUGMENTATION_KEY: draw.key.to(device)}
         embs, pad = (None, None) if self.geometry is None else self._measure(batch)
+        taken = None
         if self.training:
-            img_masks, pad = drop(draw, self.config.dropout_rates, self._cameras(), img_masks, pad)
+            left_masks, left_pad = drop(draw, self.config.dropout_rates, self._cameras(), img_masks, pad)
+            if pad is not None and left_pad is not None:
+                taken = went_without((img_masks, pad), (left_masks, left_pad))
+            img_masks, pad = left_masks, left_pad
         losses: Tensor = self.model(
             images,
             img_masks,
@@ -269,7 +282,7 @@ class PI05GeometryPolicy(PreTrainedPolicy):
             pad,
             delay=draw.delay.to(device) if self.config.rtc_training_max_delay else None,
         )
-        return losses.mean(dim=1) if losses.ndim == 4 else losses
+        return losses.mean(dim=1) if losses.ndim == 4 else losses, taken
 
     def _cameras(self) -> Cameras:
         images = [camera_of(key) for key in self.config.image_features]

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_policy_pi05_geometry.model.flow_matching import FlowDraw
-from lerobot_policy_pi05_geometry.training.dropout import Cameras, DropoutRates, drop
+from lerobot_policy_pi05_geometry.training.dropout import Cameras, DropoutRates, drop, went_without
 
 from ..entry_points import FRONT, FRONT_DEPTH, WRIST, WRIST_DEPTH, make_batch, make_features, make_policy
 
@@ -80,6 +80,16 @@ def test_against_the_rule_row_by_row(situation) -> None:
         if pad is not None:
             assert torch.equal(left_pad[row], expected_pad)
     assert (left_pad is None) == (pad is None)
+    if pad is not None:
+        expected = [
+            [bool(pad[row].any() and not left_pad[row].any()), _any(images, row) and not _any(left_images, row)]
+            for row in range(len(u))
+        ]
+        assert went_without((images, pad), (left_images, left_pad)).tolist() == expected
+
+
+def _any(masks: list[torch.Tensor], row: int) -> bool:
+    return any(bool(mask[row]) for mask in masks)
 
 
 def test_a_geometry_camera_without_an_image_that_is_lost_across_views_leaves_the_images() -> None:

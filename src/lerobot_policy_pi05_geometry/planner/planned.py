@@ -75,6 +75,6 @@ class PlannedPolicy(PI05GeometryPolicy):
         draw = FlowDraw(
             noise, torch.zeros(size, *samples), dropout=zeros, camera=zeros, delay=zeros.long(), key=zeros.long()
         )
-        losses = self._losses(batch, draw)[..., : self.config.action_feature.shape[0]]
+        losses = self._losses(batch, draw)[0][..., : self.config.action_feature.shape[0]]
         valid = torch.ones(losses.shape[:2], dtype=torch.bool)
         return losses.masked_fill(~valid[..., None], 0.0).sum() / (whole * losses[0].numel())

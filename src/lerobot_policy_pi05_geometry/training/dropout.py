@@ -83,6 +83,21 @@ def drop(
     return list((images & ~lost_images).unbind(1)), None if geom_pad is None else cells.flatten(1)
 
 
+def went_without(before: tuple[Sequence[Tensor], Tensor], after: tuple[Sequence[Tensor], Tensor]) -> Tensor:
+    """(B, 2) bool: samples from which all geometry was taken, and samples from which all images were.
+
+    before, after: I masks (B,) and geom_pad, as `drop` gets and returns them.
+    """
+    return _has(*before) & ~_has(*after)
+
+
+def _has(img_masks: Sequence[Tensor], geom_pad: Tensor) -> Tensor:
+    """(B, 2) bool: whether a sample has any geometry, and any image."""
+    geometry = geom_pad.any(dim=1)
+    images = torch.stack(list(img_masks)).any(dim=0) if img_masks else torch.zeros_like(geometry)
+    return torch.stack([geometry, images], dim=1)
+
+
 def _one_camera(which: Tensor, cameras: Cameras, images: Tensor, geometry: Tensor) -> tuple[Tensor, Tensor]:
     """What is lost with one camera of those that a sample has, if it has two or more.
 
