@@ -32,6 +32,7 @@ from tests.checkpoint.conversion.sources import write_lerobot
 from tests.datasets import write_dataset
 
 pytestmark = pytest.mark.sim
+_WEIGHTS = "trained/checkpoints/last/pretrained_model/model.safetensors"
 OPTIONS = {"policy.device": "cpu", "policy.n_action_steps": "4", "batch_size": "4"}
 FRONT_DEPTH, WRIST_DEPTH = "observation.images.front_depth", "observation.images.wrist_depth"
 
@@ -99,8 +100,8 @@ def test_what_cannot_be_studied_is_named(root, tmp_path):
         runs(folder=tmp_path)
     with pytest.raises(ValueError, match="only the simulator has"):
         runs(arms=("rgb-wide",))
-    with pytest.raises(ValueError, match="goes on from a policy of arm 'rgb'"):
-        runs(arms=("rgb", "geometry-after-rgb"))
+    with pytest.raises(ValueError, match="half of its steps from arm 'rgb', so --steps must be at least 2"):
+        runs(arms=("rgb", "geometry-after-rgb"), steps=1)
     with pytest.raises(ValueError, match="between 0 and 1"):
         runs(held_out=1.0)
     with pytest.raises(ValueError, match="--seeds must name at least one of them, and each once, got 0, 0"):
@@ -125,8 +126,8 @@ def test_only_arms_that_measure_depth_get_its_augmentation(root, tmp_path):
 @pytest.mark.train
 def test_a_study_of_a_dataset_end_to_end(root, tmp_path):
     arguments = [
-        "study", f"--dataset.root={root}", "--output", str(tmp_path), "--arms=blind,rgb,geometry", "--seeds=0", "--steps=2",
-        "--held-out=0.4", "--frames=3", "--policy.device=cpu", "--policy.paligemma_variant=tiny",
+        "study", f"--dataset.root={root}", "--output", str(tmp_path), "--arms=blind,rgb,geometry,geometry-after-rgb",
+        "--seeds=0", "--steps=3", "--held-out=0.4", "--frames=3", "--policy.device=cpu", "--policy.paligemma_variant=tiny",
         "--policy.action_expert_variant=tiny", "--policy.image_resolution=[28, 28]", "--policy.chunk_size=4",
         "--policy.n_action_steps=4", "--batch_size=4",
     ]  # fmt: skip
@@ -136,11 +137,20 @@ def test_a_study_of_a_dataset_end_to_end(root, tmp_path):
     assert "open-loop error, not success" in page
     table = pd.read_csv(tmp_path / "errors.csv")
     views = table.groupby("arm")["condition"].unique().map(set).to_dict()
-    assert views == {"blind": {ALL_CAMERAS}, "rgb": {ALL_CAMERAS}, "geometry": {ALL_CAMERAS, NO_DEPTH}}
+    both = {ALL_CAMERAS, NO_DEPTH}
+    assert views == {"blind": {ALL_CAMERAS}, "rgb": {ALL_CAMERAS}, "geometry": both, "geometry-after-rgb": both}
     assert set(table["episode"]) == {0, 1}  # two of five are held out
-    assert len(table) == (1 + 1 + 2) * 2 * 4 * 4  # views, episodes, steps ahead, dimensions
+    assert len(table) == (1 + 1 + 2 + 2) * 2 * 4 * 4  # views, episodes, steps ahead, dimensions
     geometry = table[table["arm"] == "geometry"].set_index("condition")["error"]
     assert not np.allclose(geometry[ALL_CAMERAS], geometry[NO_DEPTH])
+    steps = {
+        arm: sorted(
+            int(load_file(file)["progress.step"]) for file in (tmp_path / "runs").glob(f"mine-{arm}-0-*/{_WEIGHTS}")
+        )
+        for arm in ("rgb", "geometry-after-rgb")
+    }
+    # One step with RGB only, in a run of its own, and two more.
+    assert steps == {"rgb": [1, 3], "geometry-after-rgb": [3]}
 
 
 @pytest.mark.train

@@ -8,7 +8,7 @@ predicted.
 import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from ..checkpoint.load import LoadedPolicy, load_policy
 from ..dataset_folder import require_dataset
 from ..geometry.keys import DEPTH_SUFFIX, find_depth_key, is_depth_key
 from .arms import DEPTH, blind_inputs, find_arm
+from .locks import folder_lock
 from .own_data import Split, dataset_identity, depth_cameras, geometry_cameras, split_episodes
 from .runs import ReportProgress, Run, option_list, versions
 from .training import train_with
@@ -59,7 +60,14 @@ class HeldOutRun(Run):
 
     @property
     def steps(self) -> int:
-        return self.training_steps
+        return self.training_steps - (0 if self.before is None else self.before.training_steps)
+
+    @cached_property
+    def before(self) -> "HeldOutRun | None":
+        """The run with the first half of the steps, if the arm has one; this run trains it, and goes on from its policy."""
+        if self.arm.after is None:
+            return None
+        return replace(self, arm_name=self.arm.after, conditions=(), training_steps=self.training_steps // 2)
 
     @cached_property
     def evaluation_size(self) -> int:
@@ -74,6 +82,7 @@ class HeldOutRun(Run):
         return {
             "arm": self.arm_name,
             "arguments": self.arguments(Path("output"), Path("start")),
+            **({} if self.before is None else {"before": self.before.description()}),
             "pi05": None if self.pi05 is None else _description_of(self.pi05),
             "dataset": dataset_identity(self.dataset_root, dict(self.options)),
             "versions": versions("lerobot_policy_pi05_geometry", "lerobot", "torch"),
@@ -91,10 +100,18 @@ class HeldOutRun(Run):
         return self.folder / "start"
 
     def prepare(self, report_progress: ReportProgress) -> None:
-        """Convert the π0.5 that it starts from. The dataset exists."""
-        if self.pi05 is not None and not self.checkpoint.exists():
+        """Convert the π0.5 or the policy that it starts from. The dataset exists."""
+        if self.checkpoint.exists():
+            return
+        source = self.pi05
+        if self.before is not None:
+            with folder_lock(self.before.folder):
+                self.before.prepare(report_progress)
+                self.before.train_missing()
+            source = str(self.before.checkpoint)
+        if source is not None:
             cameras = geometry_cameras(self.dataset_root, self.repo_id, self._options())
-            make_start(self.pi05, self.start, self._options(), cameras, self.seed)
+            make_start(source, self.start, self._options(), cameras, self.seed)
 
     def train(self, output: Path) -> None:
         videos = LeRobotDatasetMetadata(self.repo_id, root=self.dataset_root).video_keys
@@ -107,7 +124,7 @@ class HeldOutRun(Run):
         The arm's options and the study's settings override the user's options.
         """
         options = self._options()
-        if self.pi05 is None:
+        if self.pi05 is None and self.before is None:
             begin: dict[str, Any] = {"policy.type": "pi05_geometry", **options}
         else:
             begin = {"policy.path": start, **remaining_options(options)}
@@ -119,8 +136,8 @@ class HeldOutRun(Run):
                 "dataset.repo_id": self.repo_id,
                 "dataset.root": self.dataset_root,
                 "dataset.eval_split": self.held_out,
-                "steps": self.training_steps,
-                "save_freq": self.training_steps,
+                "steps": self.steps,
+                "save_freq": self.steps,
                 "log_freq": self.log_every,
                 "seed": self.seed,
                 "output_dir": output,
@@ -222,11 +239,8 @@ def held_out_runs(
     for name in arms:
         if find_arm(name).cameras != "train" or find_arm(name).adapts is not None:
             raise ValueError(f"Arm '{name}' needs other camera poses in its data, which only the simulator has.")
-        if (first := find_arm(name).after) is not None:
-            raise ValueError(
-                f"Arm '{name}' goes on from a policy of arm '{first}', which a study on your own data does not do; give that "
-                "policy as --pi05, with --arms rgb geometry."
-            )
+        if (first := find_arm(name).after) is not None and steps < 2:
+            raise ValueError(f"Arm '{name}' has half of its steps from arm '{first}', so --steps must be at least 2.")
     split = split_episodes(dataset_root, repo_id, held_out, options)
     if split.untrained:
         logger.warning(

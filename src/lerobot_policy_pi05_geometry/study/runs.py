@@ -14,6 +14,7 @@ budget is another run.
 
 import hashlib
 import json
+import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -113,6 +114,15 @@ class Run(ABC):
     def complete(self) -> bool:
         """Whether it is trained and evaluated under all its conditions."""
         return self.checkpoint.exists() and not self.missing()
+
+    def train_missing(self) -> None:
+        """Train it unless it is trained. Hold the lock of its folder."""
+        if self.checkpoint.exists():
+            return
+        output = self.folder / "training"
+        shutil.rmtree(output, ignore_errors=True)  # of an interrupted training
+        self.train(output)
+        output.rename(self.folder / "trained")
 
     def to_json(self) -> str:
         """The run as JSON, for its worker."""

@@ -9,7 +9,6 @@ keeps two processes from executing the same run.
 import json
 import logging
 import os
-import shutil
 import sys
 import threading
 import time
@@ -34,11 +33,7 @@ def execute(run: Run) -> None:
     run.folder.mkdir(parents=True, exist_ok=True)
     run.prepare(_log_progress)
     with folder_lock(run.folder):
-        if not run.checkpoint.exists():
-            output = run.folder / "training"
-            shutil.rmtree(output, ignore_errors=True)  # of an interrupted training
-            run.train(output)
-            output.rename(run.folder / "trained")
+        run.train_missing()
         for condition in run.missing():
             run.evaluate(condition, _log_progress)
 
