@@ -39,8 +39,8 @@ def study(
     spec: Annotated[
         str,
         typer.Option(
-            help="A study's TOML file, or the name of one: warm-start, warm-start-short, warm-start-longer, few-steps, default, "
-            "longer, augmentation, libero, libero-front, libero-pilot, demo, smoke."
+            help="A study's TOML file, or the name of one: warm-start, warm-start-short, warm-start-after-rgb, "
+            "warm-start-longer, few-steps, default, longer, augmentation, libero, libero-front, libero-pilot, demo, smoke."
         ),
     ] = "default",
     output: Output = Path("study"),
