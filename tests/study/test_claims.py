@@ -76,7 +76,7 @@ def test_the_policy_that_got_geometry_after_rgb_is_judged_by_its_own_episodes():
     table = episodes({(*cell, 2): rate for cell, rate in rates.items()})
     found = claims(table, table, 1500)
     assert [claim.verdict for claim in found[:3]] == ["yes", "yes", "no"]
-    of_after = found[-3:]
+    of_after = found[3:6]
     assert [claim.verdict for claim in of_after] == ["no", "yes", "yes"]
     assert all(claim.claim.startswith("geometry-after-rgb: ") for claim in of_after)
     assert ["30%" in of_after[0].sentence, "+10 points" in of_after[1].sentence, "64%" in of_after[2].sentence] == [
@@ -84,6 +84,8 @@ def test_the_policy_that_got_geometry_after_rgb_is_judged_by_its_own_episodes():
     ] * 3
     without = table[table["arm"] != "geometry-after-rgb"]
     assert len(claims(without, without, 1500)) == len(found) - 3
+    alone = table[table["arm"] != "geometry"]
+    assert claims(alone, alone, 1500)[:3] == of_after  # the report begins with the first claim
 
 
 @pytest.mark.parametrize("missing", ["geometry", "rgb"])

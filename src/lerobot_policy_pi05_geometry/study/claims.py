@@ -39,11 +39,10 @@ def claims(final: pd.DataFrame, every: pd.DataFrame, steps: int) -> list[Claim]:
 
     final: of each arm's longest training. every: of all trainings. steps: training steps of multiple 1.
     """
-    found = _of_geometry(final, GEOMETRY)
+    arms = [arm for arm in (GEOMETRY, AFTER_RGB) if (final["arm"] == arm).any()]
+    found = [claim for arm in arms or [GEOMETRY] for claim in _of_geometry(final, arm)]
     for rival in RIVALS:
         found += _rival(final, every, rival, steps)
-    if (final["arm"] == AFTER_RGB).any():
-        found += _of_geometry(final, AFTER_RGB)
     return found
 
 
