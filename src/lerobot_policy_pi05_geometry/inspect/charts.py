@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 INK = "#22303c"
 COLOURS = {
     "geometry": "#0b7285",
+    "geometry-after-rgb": "#5f3dc4",
     "rgb": "#e8590c",
     "rgb-wide": "#f59f00",
     "rgb+rays": "#4263eb",
@@ -112,14 +113,14 @@ def growth_figure(
             x, of_steps = zip(*sorted(of_panel[i].items()), strict=True)
             rates = np.array(of_steps)  # (multiples, seeds)
             colour = COLOURS.get(arm, OTHER)
-            axes.plot(x, rates, color=colour, linewidth=0.7, alpha=0.5)
+            axes.plot(x, rates, color=colour, linewidth=0.7, marker=".", markersize=4, alpha=0.5)
             axes.plot(x, rates.mean(axis=1), color=colour, linewidth=2, marker="o", label=arm if i == 0 else None)
         axes.set_title(textwrap.fill(title, 40), fontsize=10)
         axes.set_xscale("log", base=2)
         axes.set_xticks(list(steps), [f"{step:,}" for step in steps])
         _rate_axis(axes)
     figure.supxlabel("training steps", fontsize=10)
-    figure.legend(loc="outside lower center", ncols=len(arms) + 1, frameon=False, fontsize=9)
+    figure.legend(loc="outside upper center", ncols=len(arms) + 1, frameon=False, fontsize=9)
     return figure
 
 
@@ -149,7 +150,7 @@ def sweep_figure(
         axes.set_xticks(list(azimuths))
         _rate_axis(axes)
     figure.supxlabel("azimuth of the camera, degrees from the middle of the training range", fontsize=10)
-    figure.legend(loc="outside lower center", ncols=len(arms) + 1, frameon=False, fontsize=9)
+    figure.legend(loc="outside upper center", ncols=len(arms) + 1, frameon=False, fontsize=9)
     return figure
 
 
