@@ -40,6 +40,15 @@ def test_they_are_running_means_over_the_batches_that_have_such_samples() -> Non
     assert WITHOUT[1] not in found
 
 
+def test_a_policy_may_be_moved_between_two_steps() -> None:
+    """The running means follow: here to a device without values."""
+    log = GeometryLog(make_policy().model.paligemma_with_expert, 0)
+    of_geometry = torch.tensor([[True, False]])
+    log.went_without(torch.tensor([1.0]), of_geometry)
+    log.went_without(torch.tensor([1.0], device="meta"), of_geometry.to("meta"))
+    assert log._without.device.type == "meta"
+
+
 @pytest.mark.parametrize("changes", [{"geometry_source": "none"}, {"geometry_dropout": 0.0, "image_dropout": 0.0}])
 def test_without_such_samples_there_are_none(changes) -> None:
     policy, batch = make_policy(**changes), make_batch(4)

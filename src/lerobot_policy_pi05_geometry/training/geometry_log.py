@@ -54,7 +54,7 @@ class GeometryLog:
         """
         count = without.sum(dim=0)
         mean = losses[:, None].masked_fill(~without, 0.0).sum(dim=0) / count.clamp_min(1)
-        before = torch.full_like(mean, math.nan) if self._without is None else self._without
+        before = torch.full_like(mean, math.nan) if self._without is None else self._without.to(mean.device)
         running = torch.where(before.isnan(), mean, MEMORY * before + (1 - MEMORY) * mean)
         self._without = torch.where(count > 0, running, before)
 
