@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lerobot_policy_pi05_geometry.geometry.da3 import VARIANTS
+from lerobot_policy_pi05_geometry.planner.command import start_option
 from lerobot_policy_pi05_geometry.planner.options import configuration, da3_variant, policy_options, typed
 from pi05_geometry_cli import app
 from pi05_geometry_cli.app import console
@@ -75,6 +76,20 @@ def test_lora_starts_from_a_checkpoint_and_needs_less():
     assert "1. lerobot-train --policy.path=CHECKPOINT " in shown
     assert "--policy.lora_targets=expert+vlm" in shown
     assert "--peft.r=3 --batch_size=8" in shown
+
+
+@pytest.mark.parametrize(
+    ("path", "variant", "lora", "begins"),
+    [
+        (None, "small", False, "--policy.type=pi05_geometry"),
+        (None, "small", True, "--policy.path=CHECKPOINT"),
+        (None, "gemma_2b", False, "--policy.path=CHECKPOINT"),  # 2.9 billion random weights are nobody's wish
+        ("mine", "gemma_2b", False, "--policy.path=mine"),
+        ("mine", "small", False, "--policy.path=mine"),
+    ],
+)
+def test_a_proposed_command_trains_random_weights_at_small_sizes_only(path, variant, lora, begins):
+    assert start_option(path, variant, lora) == begins
 
 
 def test_features_from_a_store_need_no_encoder_in_training():

@@ -92,12 +92,18 @@ def _proposals(
         )
         raise ValueError(f"Nothing fits {budget / GIB:.1f} GiB ({why}); give a larger GPU, or fix fewer settings.")
     yield proposal_table(found, budget)
+    variant = make_config({}).paligemma_variant
     for number, proposal in enumerate(found, 1):
-        start = "--policy.type=pi05_geometry"
-        if "path" in options or proposal.recipe.lora:  # LoRA needs pretrained weights
-            start = f"--policy.path={options.get('path', SOMEWHERE)}"
+        start = start_option(options.get("path"), variant, proposal.recipe.lora)
         yield escape(f"{number}. lerobot-train {start} {' '.join(proposal.options())} ...")
     if wish.explain:
         yield split_table({str(number): proposal.split for number, proposal in enumerate(found, 1)})
     for rejection in rejected if wish.explain else [r for r in rejected if r.unavailable]:
         yield escape(f"Not proposed: {rejection.recipe.name}, since {rejection.why}.")
+
+
+def start_option(path: str | None, variant: str, lora: bool) -> str:
+    """What lerobot-train begins with: a checkpoint, or random weights. path: the user's checkpoint; None if none was given."""
+    if path is None and variant != "gemma_2b" and not lora:
+        return "--policy.type=pi05_geometry"
+    return f"--policy.path={path or SOMEWHERE}"  # the released size and LoRA need pretrained weights
