@@ -80,8 +80,13 @@ def test_a_number_of_nothing_is_refused(arguments, tmp_path, monkeypatch):
 @pytest.fixture
 def started(monkeypatch):
     """Nothing is trained: the runs that a study would start, and the command that its report would show."""
-    seen = {"runs": [], "commands": []}
-    monkeypatch.setattr("pi05_geometry_cli.studies._execute", lambda runs, *_: seen["runs"].extend(runs))
+    seen = {"runs": [], "commands": [], "workers": None}
+
+    def execute(runs, workers, _):
+        seen["runs"].extend(runs)
+        seen["workers"] = workers
+
+    monkeypatch.setattr("pi05_geometry_cli.studies._execute", execute)
     monkeypatch.setattr("lerobot_policy_pi05_geometry.study.launch.wait_for", lambda _: None)
     for module in ("held_out_report.write_held_out_report", "report.write_report"):
         name = f"lerobot_policy_pi05_geometry.study.{module}"
@@ -133,6 +138,49 @@ def test_the_command_that_repeats_a_study_has_every_option(options, tmp_path, st
     half = len(started["runs"]) // 2
     assert [run.folder for run in started["runs"][:half]] == [run.folder for run in started["runs"][half:]]
     assert started["commands"][0] == started["commands"][1]
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(
+    ("best", "options", "workers"),
+    [
+        ("cuda", [], 1),
+        ("cpu", [], None),
+        ("cuda", ["--policy.device=cpu"], None),
+        ("cpu", ["--policy.device=cuda"], 1),
+        ("cuda", ["--workers", "3"], 3),
+    ],
+)
+def test_an_accelerator_has_one_run_at_once(best, options, workers, tmp_path, started, monkeypatch):
+    """Without --policy.device LeRobot takes the best device that there is."""
+    monkeypatch.setattr("lerobot.utils.device_utils.auto_select_torch_device", lambda: torch.device(best))
+    root = write_dataset(tmp_path / "data")
+    arguments = ["--output", str(tmp_path / "out"), f"--dataset.root={root}", "--arms=rgb", *options]
+    result = CliRunner().invoke(app, ["study", *arguments])
+    assert result.exit_code == 0, result.output
+    assert started["workers"] == workers
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(("device", "workers"), [("cuda", 1), ("cpu", None)])
+def test_an_accelerator_has_one_simulated_run_at_once(device, workers, tmp_path, started):
+    spec = tmp_path / "spec.toml"
+    tables = "[[compare]]\ntasks = ['button-press-wide']\narms = ['rgb']\nconditions = ['inside']"
+    spec.write_text(f"seeds = [0]\n[budget]\ndevice = '{device}'\n{tables}\n")
+    result = CliRunner().invoke(app, ["study", "--spec", str(spec), "--output", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    assert started["workers"] == workers
+
+
+@pytest.mark.sim
+def test_ranks_do_not_retry_crashed_runs(tmp_path, started, monkeypatch):
+    """A rank could take the crash that another rank is about to retry for the end of that run."""
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    arguments = ["study", "--smoke", "--output", str(tmp_path / "out"), "--retry-crashed"]
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, ValueError), result.output
+    assert f"Remove {tmp_path / 'out'}/runs/*/crashed.json" in str(result.exception)
+    assert not started["runs"]
 
 
 def test_a_conversion_that_fails_leaves_nothing(tmp_path):

@@ -75,7 +75,14 @@ def study(
     With --dataset.root the study runs on your own dataset: it trains on most episodes and measures the action error on the
     others. All further options go to lerobot-train (`--policy.dtype=bfloat16 --policy.device=cuda --batch_size=8`).
     """
+    from lerobot_policy_pi05_geometry.study.launch import rank, ranks, wait_for
+
     given = _given_options(context)
+    if retry_crashed and ranks() > 1:
+        raise ValueError(
+            f"--retry-crashed is for a study without a launcher: a rank cannot tell an old crash from a new one. Remove "
+            f"{output}/runs/*/crashed.json instead, and start the ranks without it."
+        )
     if dataset_root is None:
         foreign = [*(given[name][0] for name in _OF_OWN_DATA if name in given), *context.args]
         if foreign:
@@ -93,9 +100,10 @@ def study(
             return
         path = _simulated_study(name, output, workers, retry_crashed, _command(context))
     else:
+        from lerobot.utils.device_utils import auto_select_torch_device
+
         from lerobot_policy_pi05_geometry.study.held_out import held_out_runs
         from lerobot_policy_pi05_geometry.study.held_out_report import write_held_out_report
-        from lerobot_policy_pi05_geometry.study.launch import rank, wait_for
 
         foreign = [given[name][0] for name in _SIMULATED if name in given]
         if foreign:
@@ -108,7 +116,8 @@ def study(
         runs = held_out_runs(
             output, dataset_root, dataset_repo_id, arms.split(","), numbers, options, steps, held_out, frames, pi05
         )
-        if workers is None and options.get("policy.device", "cpu") != "cpu":
+        device = options.get("policy.device") or auto_select_torch_device().type  # LeRobot's choice
+        if workers is None and device != "cpu":
             workers = 1  # one run at a time on an accelerator
         _execute(runs, workers, retry_crashed)
         wait_for(runs)
@@ -166,6 +175,8 @@ def _simulated_study(name: str, output: Path, workers: int | None, retry_crashed
 
     spec = read_spec(name)
     require_tasks(spec)
+    if workers is None and spec.budget.device != "cpu":
+        workers = 1  # one run at a time on an accelerator
     grows = spec.growth.multiples != (1,) or spec.sweep is not None
     if grows and rank() == 0:
         _print_estimate(name, output)

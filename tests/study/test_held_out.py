@@ -183,6 +183,13 @@ def test_an_own_grid_is_converted_to_and_not_given_twice(root, tmp_path):
     assert other.folder != run.folder != replace(run, pi05=None).folder
 
 
+def test_an_arm_that_a_conversion_undoes_is_refused(root, tmp_path):
+    for arm in ("prefix", "gate-closed", "parallel"):
+        with pytest.raises(ValueError, match=f"'{arm}' is for policies trained from scratch"):
+            held_out_runs(tmp_path, root, "local/mine", [arm], [0], {}, 2, 0.4, 3, "pi05")
+        assert held_out_runs(tmp_path, root, "local/mine", [arm], [0], {}, 2, 0.4, 3)
+
+
 def test_a_pi05_that_was_trained_on_is_another_one(root, tmp_path):
     pi05 = tmp_path / "pi05"
     pi05.mkdir()

@@ -1,5 +1,7 @@
 """What the report of a study on own data concludes from errors that are made up."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from lerobot.configs.default import DatasetConfig
@@ -7,6 +9,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.factory import make_train_eval_datasets
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
+from lerobot_policy_pi05_geometry.study import held_out_report
 from lerobot_policy_pi05_geometry.study.held_out import held_out_runs
 from lerobot_policy_pi05_geometry.study.held_out_report import collect, headline, write_held_out_report
 from lerobot_policy_pi05_geometry.study.own_data import Split, split_episodes
@@ -43,10 +46,32 @@ def test_the_numbers_of_episodes_are_lerobots(tmp_path, caplog):
         held_out_runs(tmp_path / "out", root, "local/mine", ["rgb"], [0], chosen, 2, 0.2, 3)
 
 
-def executed(root, output, errors, episodes, crashed=()):
+def test_an_action_that_never_changes_has_no_standard_deviation_to_measure_in(tmp_path, monkeypatch):
+    (run,) = executed(write_dataset(tmp_path / "mine"), tmp_path / "out", {("rgb", 0): 0.5}, 3)
+    expected = collect([run])["rgb", "all-cameras"].values
+    stats = held_out_report.LeRobotDatasetMetadata(run.repo_id, root=run.dataset_root).stats
+    moving = stats["action"]["std"].copy()
+    assert (moving > 0).all()
+    stats["action"]["min"][1] = stats["action"]["max"][1]
+    stats["action"]["std"][1] = 1e-12
+    monkeypatch.setattr(held_out_report, "LeRobotDatasetMetadata", lambda *_, **__: SimpleNamespace(stats=stats))
+    (errors,) = [found.values for found in collect([run]).values()]
+    others = np.delete(1 / moving, 1).mean() / (1 / moving).mean()
+    np.testing.assert_allclose(errors, expected * others)
+
+
+def test_the_report_states_all_steps_of_an_arm_after_another_one(tmp_path):
+    root = write_dataset(tmp_path / "mine", depth=("observation.images.front_depth",))
+    runs = executed(root, tmp_path / "out", {("geometry-after-rgb", 0): 0.5, ("rgb", 0): 0.5}, 3, steps=30)
+    assert [run.steps for run in runs] == [15, 30]
+    page = write_held_out_report(tmp_path / "out", runs, "pi05-geometry study").read_text()
+    assert "2 training runs of 30 steps" in page
+
+
+def executed(root, output, errors, episodes, crashed=(), steps=2):
     """Runs of two arms without depth; errors: (arm, seed) -> error of each of so many held-out episodes."""
     arms, seeds = (list(dict.fromkeys(names)) for names in zip(*errors, strict=True))
-    runs = held_out_runs(output, root, "local/mine", arms, seeds, {}, 2, 0.4, 3)
+    runs = held_out_runs(output, root, "local/mine", arms, seeds, {}, steps, 0.4, 3)
     for run in runs:
         run.folder.mkdir(parents=True)
         if (run.arm_name, run.seed) in crashed:
@@ -54,7 +79,8 @@ def executed(root, output, errors, episodes, crashed=()):
             continue
         run.log.touch()
         values = np.full((episodes, 4, ACTION_DIM), errors[run.arm_name, run.seed])
-        np.savez_compressed(run.outcome("all-cameras"), errors=values + 0.01 * np.arange(episodes)[:, None, None])
+        for condition in run.distinct_conditions():
+            np.savez_compressed(run.outcome(condition), errors=values + 0.01 * np.arange(episodes)[:, None, None])
     return runs
 
 

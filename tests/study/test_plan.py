@@ -4,8 +4,10 @@ import dataclasses
 import json
 from types import SimpleNamespace
 
+import matplotlib.pyplot as plt
 import pandas as pd
 import pytest
+import torch
 
 from lerobot_policy_pi05_geometry import PI05GeometryConfig
 from lerobot_policy_pi05_geometry.study import adapted, growth_report, simulated
@@ -120,6 +122,49 @@ def test_an_arm_after_another_one_stops_by_the_same_rule(tmp_path):
     assert multiples == {"rgb": [1, 2, 4, 8], "geometry-after-rgb": [2, 4]}
 
 
+def test_an_arm_after_another_one_ends_with_it(tmp_path):
+    """Without RGB at 4 x there is nothing to go on from at 8 x, however much the arm itself gained."""
+
+    def rate(run, condition):
+        return 0.5 if isinstance(run, PretrainingRun) or run.arm_name == "rgb" else min(1.0, rises(run, condition))
+
+    spec = dataclasses.replace(AFTER_RGB, growth=Growth((1, 2, 4, 8)))
+    runs = [run for phase in executed(tmp_path, spec, rate)[1:] for run in phase.runs]
+    assert max(run.multiple for run in runs if run.arm_name == "rgb") == 2
+    assert max(run.multiple for run in runs if run.arm_name == "geometry-after-rgb") == 4
+
+
+def test_azimuths_may_be_compared_and_swept(tmp_path, monkeypatch):
+    """The table has a compared one after the longest training, and the sweep nothing but that, once."""
+    drawn = {}
+    monkeypatch.setattr(
+        growth_report, "sweep_figure", lambda tasks, azimuths, arms, trained: drawn.update(arms) or plt.figure()
+    )
+
+    def rate(run, condition):
+        return 0.1 if run.multiple == 1 else 0.9
+
+    spec = dataclasses.replace(
+        SPEC,
+        pretraining=None,
+        comparisons=(
+            Comparison(TASKS[:1], ("rgb", "geometry"), ("inside", "outside", "azimuth+30", "azimuth+50-steps-3")),
+        ),
+        growth=Growth((1, 2)),
+        sweep=Sweep((-30, 30), ("rgb", "geometry")),
+    )
+    runs = [run for phase in executed(tmp_path, spec, rate) for run in phase.runs]
+    page = write_growth_report(tmp_path, spec, runs, "pi05-geometry study").read_text()
+    for title in ("camera at +30 degrees", "camera at +50 degrees, 3 denoising steps"):
+        assert title in page
+    assert "camera at -30 degrees" not in page  # swept only
+    for arm in ("rgb", "geometry"):
+        assert drawn[arm][0][0] == pytest.approx([0.9, 0.9])
+    table = pd.read_csv(tmp_path / "episodes.csv")
+    assert not table.duplicated().any()
+    assert (table["condition"] == "azimuth+30").sum() == 2 * 2 * 2 * 20  # arms x multiples x seeds x episodes
+
+
 def test_a_curve_stands_at_the_steps_that_it_was_trained_with(tmp_path, monkeypatch):
     drawn = {}
     real = growth_report.growth_figure
@@ -228,6 +273,20 @@ def test_the_study_that_comes_along_is_the_one_that_was_promised(tmp_path):
     assert {(run.task, run.arm_name) for run in runs} == {(task, arm) for task in tasks for arm in arms}
     geometry = next(run for run in runs if run.arm_name == "geometry")
     assert {"inside", "outside", "depth-off", "noise", "calibration-1"} <= set(geometry.conditions)
+
+
+def test_an_adapted_policy_is_built_with_its_training_seed(tmp_path, monkeypatch):
+    """A policy takes the seed of its training noise then; so the same run gives the same policy in any process."""
+    seen = []
+    monkeypatch.setattr(adapted, "adapt", lambda *_: None)
+    monkeypatch.setattr(adapted, "LeRobotDataset", lambda *_, **__: None)
+    loaded = SimpleNamespace(policy=SimpleNamespace(config=PI05GeometryConfig(device="cpu")))
+    monkeypatch.setattr(simulated, "load_policy", lambda *_, **__: seen.append(torch.initial_seed()) or loaded)
+    for run in runs_of(SPEC, tmp_path):
+        if run.arm_name == "rgb+modulation":
+            torch.seed()
+            run.load("inside", run.simulated.environment("train", 28))
+    assert seen == [0, 0, 1, 1]
 
 
 @pytest.mark.parametrize("arm", ["geometry", "rgb+modulation"])

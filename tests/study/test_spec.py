@@ -142,6 +142,11 @@ def test_a_value_that_cannot_be_is_named_before_anything_is_trained(tmp_path, ch
         read_spec(write(tmp_path, SPEC.replace(*change)))
 
 
+def test_an_arm_is_for_training_from_scratch_if_a_conversion_would_undo_it():
+    """For a converted policy these would crash (prefix), or train another arm under their name."""
+    assert [name for name, arm in ARMS.items() if arm.from_scratch] == ["prefix", "gate-closed", "parallel"]
+
+
 def test_a_file_that_is_not_there_is_named():
     with pytest.raises(FileNotFoundError, match="default"):
         read_spec("defautl")
@@ -174,6 +179,7 @@ def test_an_azimuth_is_a_condition():
     assert (condition.cameras, condition.sensor) == ("azimuth-30", "ideal")
     assert azimuth_of(azimuth_condition(-30)) == -30
     assert azimuth_of(azimuth_condition(7.5)) == 7.5
+    assert azimuth_of("azimuth-30-steps-3") == -30
     assert azimuth_of("outside") is None
     assert find_range(condition.cameras).azimuth == ((-30.0, -30.0),)
     for wrong in ("azimuth", "azimuth+north", "azimuthnan", "azimuth+inf"):
@@ -260,6 +266,7 @@ def test_a_warm_start_is_read_and_reaches_the_worker(tmp_path):
             ('arms = ["rgb", "geometry"]', 'arms = ["rgb", "geometry-after-rgb"]'),
             "needs two multiples of which one is twice",
         ),
+        (('arms = ["rgb", "geometry"]', 'arms = ["rgb", "prefix"]'), "'prefix' is for policies trained from scratch"),
         (("[growth]", "[growth]\nfactor = 2"), "unknown entries factor"),
         (('["faucet-open-wide"]', '["faucet-open-wide"]\nevaluated = ["reach-v3"]'), "on which it is not trained"),
     ],

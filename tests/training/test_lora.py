@@ -1,5 +1,6 @@
 """LoRA: what is adapted, what is trained in full, and that it is saved, resumed and folded in."""
 
+import json
 import re
 
 import pytest
@@ -109,6 +110,9 @@ def test_saved_reloaded_and_merged_it_acts_the_same(base, tmp_path):
     merge(saved, merged)
     again = load_policy(merged).policy
     assert not again.config.use_peft
+    settings = json.loads((merged / "config.json").read_text())
+    assert settings["device"] is None  # whoever loads it takes the best one there is
+    assert settings["pretrained_path"] is None
     assert again.training_step == 3
     assert torch.equal(chunk_of(again, batch), chunk_of(loaded, batch))
     with pytest.raises(FileNotFoundError, match="was not trained with LoRA"):

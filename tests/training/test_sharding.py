@@ -13,6 +13,7 @@ from torch.distributed.tensor import DTensor
 from torch.nn.parallel import DistributedDataParallel
 
 from lerobot_policy_pi05_geometry.modeling_pi05_geometry import PI05GeometryPolicy
+from lerobot_policy_pi05_geometry.training.geometry_log import GeometryLog
 from lerobot_policy_pi05_geometry.training.micro_batches import rows_of
 from lerobot_policy_pi05_geometry.training.sharding import fsdp_units, shard
 from tests.entry_points import CHUNK, make_batch, make_policy
@@ -91,6 +92,12 @@ def process(rank: int, folder: Path) -> None:
         losses = torch.tensor(train(policy, model, rows))
         dist.all_reduce(losses)
         results[case] = (losses / PROCESSES, {name: whole(p) for name, p in policy.state_dict().items()})
+    log = GeometryLog(make_policy().model.paligemma_with_expert, 0)
+    without = [[[False, True], [True, False]], [[True, False], [False, False]]][
+        rank
+    ]  # images are taken on one rank only
+    log.went_without(torch.tensor([[5.0, 1.0], [3.0, 9.0]][rank]), torch.tensor(without))
+    torch.save(log.numbers(), folder / f"numbers{rank}.pt")
     if rank == 0:
         torch.save(results, folder / "results.pt")
     dist.destroy_process_group()
@@ -100,7 +107,8 @@ def process(rank: int, folder: Path) -> None:
 def results(tmp_path_factory) -> dict:
     folder = tmp_path_factory.mktemp("processes")
     mp.spawn(process, args=(folder,), nprocs=PROCESSES)
-    return torch.load(folder / "results.pt", weights_only=True)
+    numbers = [torch.load(folder / f"numbers{rank}.pt", weights_only=True) for rank in range(PROCESSES)]
+    return torch.load(folder / "results.pt", weights_only=True) | {"numbers": numbers}
 
 
 @pytest.mark.slow
@@ -117,6 +125,15 @@ def test_two_processes_train_as_one(results, case):
         torch.testing.assert_close(weights[name], tensor, atol=1e-4, rtol=0, msg=name)
     moved = sum(not torch.equal(start[name], tensor) for name, tensor in weights.items())
     assert moved > 20
+
+
+@pytest.mark.slow
+def test_every_process_logs_the_same_losses_of_samples_that_went_without(results):
+    """LeRobot averages the log over processes by the place of an entry, so a process must not lack one."""
+    first, second = results["numbers"]
+    assert list(first.items()) == list(second.items())
+    assert first["loss_without_geometry"] == pytest.approx((1.0 + 3.0) / 2)
+    assert first["loss_without_images"] == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize("param_dtype", ["float32", "bfloat16"])

@@ -3,10 +3,9 @@
 import shutil
 from pathlib import Path
 
-from ..weight_files.files import new_folder
+from ..weight_files.files import ADAPTER_CONFIG, new_folder
+from .conversion.settings import save_config
 from .load import load_policy
-
-ADAPTER_CONFIG = "adapter_config.json"
 
 
 def merge(checkpoint: Path, output: Path) -> None:
@@ -21,5 +20,7 @@ def merge(checkpoint: Path, output: Path) -> None:
     size = sum(tensor.numel() * tensor.element_size() for tensor in policy.state_dict().values())
     with new_folder(output, size) as folder:
         policy.save_pretrained(folder)
+        policy.config.pretrained_path = None
+        save_config(policy.config, folder)  # without the device that it was merged on
         for file in sorted(checkpoint.glob("policy_*")):  # the two processors and their tensors
             shutil.copy(file, folder / file.name)

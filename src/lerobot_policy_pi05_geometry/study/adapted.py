@@ -5,6 +5,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 
@@ -41,7 +42,8 @@ class AdaptedRun(SimulatedRun):
         return Recording(self.root, self.task, cameras, 1, self.budget.image_size, seed=1 + self.seed)
 
     def description(self) -> dict[str, Any]:
-        return {"adapted": self.base.description(), "rate": LEARNING_RATE, **asdict(self.budget)}
+        content = {"adapted": self.base.description(), "rate": LEARNING_RATE, "noise": self.seed}
+        return {**content, **asdict(self.budget)}
 
     def evaluation_description(self, condition: str) -> dict[str, Any]:
         demonstration = self.demonstration(condition).description()
@@ -54,6 +56,7 @@ class AdaptedRun(SimulatedRun):
             self.demonstration(condition).make(report_progress)
 
     def load(self, condition: str, environment: EnvConfig) -> LoadedPolicy:
+        torch.manual_seed(self.seed)  # a policy takes the seed of its training noise when it is built
         loaded = super().load(condition, environment)
         demonstration, config = self.demonstration(condition), loaded.policy.config
         dataset = LeRobotDataset(

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 DEPTH, POSE = "depth", "pose"  # what an arm may read besides RGB, and what a faulty sensor may change
+_DECIDED_BY_CONVERSION = ("policy.geometry_placement", "policy.geometry_positions", "policy.geometry_gate_openness")
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,11 @@ class Arm:
     blind: bool = False
     adapts: str | None = None
     after: str | None = None
+
+    @property
+    def from_scratch(self) -> bool:
+        """Whether it is for policies trained from scratch only, since a conversion decides what it changes."""
+        return not self.options.keys().isdisjoint(_DECIDED_BY_CONVERSION)
 
 
 def blind_inputs(shape: Sequence[int]) -> dict[str, str]:
@@ -93,3 +99,12 @@ def find_arm(name: str) -> Arm:
     if name not in ARMS:
         raise ValueError(f"There is no arm '{name}'; choose one of: {', '.join(ARMS)}.")
     return ARMS[name]
+
+
+def refuse_from_scratch(arm: str) -> None:
+    """Raise ValueError for an arm that has no meaning for a converted policy."""
+    if find_arm(arm).from_scratch:
+        raise ValueError(
+            f"Arm '{arm}' is for policies trained from scratch: a conversion decides what it changes. Leave the arm out, or the "
+            "pretrained policy."
+        )

@@ -48,7 +48,8 @@ def azimuth_condition(degrees: float) -> str:
 
 def azimuth_of(name: str) -> float | None:
     """Azimuth of a condition of `azimuth_condition`, in degrees; None for any other condition."""
-    return float(name.removeprefix(_AZIMUTH)) if name.startswith(_AZIMUTH) else None
+    condition, _ = split_steps(name)
+    return float(condition.removeprefix(_AZIMUTH)) if condition.startswith(_AZIMUTH) else None
 
 
 def split_steps(name: str) -> tuple[str, int | None]:

@@ -11,7 +11,7 @@ from ..inspect.page import Page, picture
 from ..sim.cameras import CAMERA_RANGES
 from .arms import ARMS
 from .claims import claims
-from .conditions import azimuth_of, find_condition, order_of
+from .conditions import azimuth_condition, azimuth_of, find_condition, order_of
 from .pretraining import PretrainingRun
 from .report import floor_sentence
 from .results import cells, episodes_table, success_matrix
@@ -33,13 +33,14 @@ def write_growth_report(
     runs: of all phases. command: how the study was started; shown so that a reader can repeat it.
     """
     simulated = [run for run in runs if isinstance(run, SimulatedRun)]
-    table = episodes_table(simulated)
+    table = episodes_table(simulated).drop_duplicates(ignore_index=True)  # a condition may be compared and swept
     table.to_csv(folder / "episodes.csv", index=False)
     table.to_parquet(folder / "episodes.parquet", index=False)
     pictures = folder / "pictures"
     pictures.mkdir(exist_ok=True)
-    in_sweep = table["condition"].map(lambda name: azimuth_of(name) is not None)
-    compared, swept = table[~in_sweep], table[in_sweep]
+    named = {name for comparison in spec.comparisons for name in comparison.conditions}
+    azimuths = [] if spec.sweep is None else [azimuth_condition(degrees) for degrees in spec.sweep.azimuths]
+    compared, swept = (table[table["condition"].isin(names)] for names in (named, azimuths))
     final = _with_last_multiple(compared)
     page = Page("Warm start: does geometry help a pretrained π0.5?" if spec.pretraining else "Does geometry help?")
     found = claims(final, compared, spec.budget.steps)
@@ -53,7 +54,7 @@ def write_growth_report(
     for task in final["task"].unique():
         _task(page, task, final[final["task"] == task], pictures)
     if spec.sweep is not None and len(swept):
-        _sweep(page, spec, swept, pictures)
+        _sweep(page, spec, _with_last_multiple(swept), pictures)
     page.heading("Limitations")
     page.text(
         "The networks are small and were pretrained on few simulated tasks; depth is simulated and the experts are "

@@ -24,7 +24,7 @@ from torch.utils.data import default_collate
 from ..checkpoint.load import LoadedPolicy, load_policy
 from ..dataset_folder import require_dataset
 from ..geometry.keys import DEPTH_SUFFIX, find_depth_key, is_depth_key
-from .arms import DEPTH, blind_inputs, find_arm
+from .arms import DEPTH, blind_inputs, find_arm, refuse_from_scratch
 from .locks import folder_lock
 from .own_data import Split, dataset_identity, depth_cameras, geometry_cameras, split_episodes
 from .runs import ReportProgress, Run, option_list, versions
@@ -239,6 +239,8 @@ def held_out_runs(
     for name in arms:
         if find_arm(name).cameras != "train" or find_arm(name).adapts is not None:
             raise ValueError(f"Arm '{name}' needs other camera poses in its data, which only the simulator has.")
+        if pi05 is not None:
+            refuse_from_scratch(name)
         if (first := find_arm(name).after) is not None and steps < 2:
             raise ValueError(f"Arm '{name}' has half of its steps from arm '{first}', so --steps must be at least 2.")
     split = split_episodes(dataset_root, repo_id, held_out, options)

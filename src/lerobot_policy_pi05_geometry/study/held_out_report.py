@@ -45,7 +45,7 @@ def write_held_out_report(folder: Path, runs: Sequence[HeldOutRun], command: str
     seeds, first = len({run.seed for run in runs}), runs[0]
     split = first.split
     page.text(
-        f"{len(runs)} training runs of {first.steps} steps, {seeds} training seed{'s' if seeds > 1 else ''}; "
+        f"{len(runs)} training runs of {first.training_steps} steps, {seeds} training seed{'s' if seeds > 1 else ''}; "
         f"{split.held_out} of {split.trained + split.held_out} episodes were held out, the last ones of each task. Errors are "
         "mean absolute errors of predicted action chunks, in "
         f"standard deviations of the recorded actions{_about_intervals(errors)}"
@@ -94,7 +94,7 @@ def collect(runs: Sequence[HeldOutRun]) -> Errors:
     for run in runs:
         if run.crash.exists():
             continue
-        scale = np.maximum(_action_spread(run), 1e-9)
+        scale = _action_spread(run)
         for condition in run.conditions:
             errors = run.errors(condition)
             if errors is None:
@@ -164,8 +164,10 @@ def _paired(errors: Errors, arm: str, other: str, condition: str) -> tuple[np.nd
 
 
 def _action_spread(run: HeldOutRun) -> np.ndarray:
-    stats = LeRobotDatasetMetadata(run.repo_id, root=run.dataset_root).stats
-    return np.asarray(stats[ACTION]["std"], dtype=np.float64).reshape(-1)
+    """Standard deviation of every action dimension, (D,); NaN of one that never changes, in which no error is measured."""
+    stats = LeRobotDatasetMetadata(run.repo_id, root=run.dataset_root).stats[ACTION]
+    low, high, spread = (np.asarray(stats[name], dtype=np.float64).reshape(-1) for name in ("min", "max", "std"))
+    return np.where(low == high, np.nan, spread)
 
 
 def _complete_steps(errors: np.ndarray) -> np.ndarray:

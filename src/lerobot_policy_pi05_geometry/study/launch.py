@@ -66,12 +66,17 @@ class Progress:
 
 def share(runs: Sequence[Run]) -> list[Run]:
     """The runs of this rank: every WORLD_SIZE-th, or all without a launcher."""
-    return list(runs)[rank() :: int(os.environ.get("WORLD_SIZE", "1"))]
+    return list(runs)[rank() :: ranks()]
 
 
 def rank() -> int:
     """This process's rank under a launcher; 0 without one."""
     return int(os.environ.get("RANK", "0"))
+
+
+def ranks() -> int:
+    """The number of ranks under a launcher; 1 without one."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def default_workers() -> int:

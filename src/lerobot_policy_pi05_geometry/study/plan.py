@@ -74,6 +74,9 @@ def phases(spec: StudySpec, root: Path) -> Iterator[Phase]:
 
 def continues(arm: str, spec: StudySpec, done: Sequence[SimulatedRun], multiple: int) -> bool:
     """Whether an arm gets this multiple of the steps: it has been trained with all smaller ones and improved with the last."""
+    first = find_arm(arm).after
+    if first is not None and not any(run.arm_name == first and 2 * run.multiple == multiple for run in done):
+        return False  # there is no policy to go on from: that arm stopped improving before
     smaller = [m for m in spec.growth.multiples_of(arm) if m < multiple]
     if len(smaller) < 2:
         return True

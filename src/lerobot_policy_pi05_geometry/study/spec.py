@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from ..model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
-from .arms import find_arm
+from .arms import find_arm, refuse_from_scratch
 from .conditions import azimuth_condition, find_condition
 from .simulated_tasks import simulated_task
 from .value_checks import check_values
@@ -174,6 +174,8 @@ class StudySpec:
                 if adapted is not None and adapted not in comparison.arms:
                     raise ValueError(f"Arm '{name}' adapts arm '{adapted}'; name both in the same [[compare]] block.")
                 self._check_halves(name, comparison)
+                if self.pretraining is not None:
+                    refuse_from_scratch(name)
             for name in comparison.conditions:
                 find_condition(name)
             if len(self.growth.multiples) > 1 and not set(self.growth.conditions) <= set(comparison.conditions):

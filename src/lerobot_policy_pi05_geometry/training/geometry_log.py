@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
+import torch.distributed as dist
 from torch import Tensor, nn
 
 from ..model.paligemma_with_expert import PaliGemmaWithExpert
@@ -50,10 +51,15 @@ class GeometryLog:
     def went_without(self, losses: Tensor, without: Tensor) -> None:
         """Follow the losses of samples from which something was taken.
 
-        losses: (B,). without: (B, 2) bool, the samples without geometry and those without images.
+        losses: (B,). without: (B, 2) bool, the samples without geometry and those without images. Over all processes of a
+        distributed training: LeRobot averages what they log by its place in the log, so all must have the same entries.
         """
-        count = without.sum(dim=0)
-        mean = losses[:, None].masked_fill(~without, 0.0).sum(dim=0) / count.clamp_min(1)
+        total = torch.stack(
+            [losses[:, None].masked_fill(~without, 0.0).sum(dim=0), without.sum(dim=0).to(losses.dtype)]
+        )
+        if dist.is_available() and dist.is_initialized():
+            dist.all_reduce(total)
+        mean, count = total[0] / total[1].clamp_min(1), total[1]
         before = torch.full_like(mean, math.nan) if self._without is None else self._without.to(mean.device)
         running = torch.where(before.isnan(), mean, MEMORY * before + (1 - MEMORY) * mean)
         self._without = torch.where(count > 0, running, before)

@@ -9,6 +9,7 @@ from benchmarks.lerobot_pi05 import LM_HEADS, load_lerobot_policy
 from safetensors.torch import load_file, save_file
 
 from lerobot_policy_pi05_geometry.checkpoint.conversion import GeometryStart, convert, export
+from lerobot_policy_pi05_geometry.geometry.depth_augmentation import DepthAugmentation
 from tests.entry_points import GEOMETRY, chunk_of, make_batch, make_policy, make_processors, without
 from tests.geometry.da3.tiny import write_tiny
 
@@ -99,6 +100,16 @@ def test_what_is_no_checkpoint_of_ours_is_refused(tmp_path):
     with pytest.raises(ValueError, match="of type 'pi05', not 'pi05_geometry'"):
         export(tmp_path / "source", tmp_path / "output")
     assert folder_contents(tmp_path) == {"source"}
+
+
+def test_a_policy_trained_with_depth_augmentation_is_exported(tmp_path):
+    """It belongs to depth, which an export does not have."""
+    policy = make_policy(depth_augmentation=DepthAugmentation(noise=0.004, holes=0.1, shift=0.005))
+    policy.save_pretrained(tmp_path / "trained")
+    for pipeline in make_processors(policy.config):
+        pipeline.save_pretrained(tmp_path / "trained")
+    export(tmp_path / "trained", tmp_path / "exported")
+    assert (tmp_path / "exported" / WEIGHTS).is_file()
 
 
 def test_an_export_needs_no_depth_anything_3(tmp_path):

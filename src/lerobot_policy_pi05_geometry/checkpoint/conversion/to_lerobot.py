@@ -10,6 +10,7 @@ from typing import Any
 from accelerate import init_empty_weights
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 
+from ...geometry.depth_augmentation import DepthAugmentation
 from ...model.variants import EXPERT_VARIANTS
 from ...modeling_pi05_geometry import PI05GeometryPolicy
 from ...weight_files.files import CONFIG_FILE, find_file, new_folder
@@ -44,7 +45,8 @@ def export(source: str | Path, output: Path, **hub: Any) -> None:
             config.paligemma_variant,
         )
     with init_empty_weights(include_buffers=False):  # without geometry: neither its weights nor its encoder are needed
-        policy = PI05GeometryPolicy(replace(deepcopy(config), geometry_source="none"))
+        plain = replace(deepcopy(config), geometry_source="none", depth_augmentation=DepthAugmentation())
+        policy = PI05GeometryPolicy(plain)
     stored = {name: tensor for name, tensor in read_tensors(file).items() if not is_new(name)}
     check_weights(file, inherited_shapes(policy), stored)
     embedding = stored[PREFIX + EMBEDDING]

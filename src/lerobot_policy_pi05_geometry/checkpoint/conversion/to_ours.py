@@ -13,8 +13,7 @@ from torch import Tensor
 from ...configuration_pi05_geometry import PI05GeometryConfig
 from ...model.variants import EXPERT_VARIANTS, PALIGEMMA_VARIANTS
 from ...modeling_pi05_geometry import PI05GeometryPolicy
-from ...weight_files.files import CONFIG_FILE, find_file, find_optional_file, new_folder
-from ..merge import ADAPTER_CONFIG
+from ...weight_files.files import ADAPTER_CONFIG, CONFIG_FILE, find_file, find_optional_file, new_folder
 from .geometry_start import GeometryStart, has_images
 from .names import PREFIX, find_parameters
 from .other_geometry import other_geometry
