@@ -89,6 +89,12 @@ def test_the_report_holds_every_figure(study):
     assert table.groupby(["arm", "training_seed", "condition"])["episode_seed"].apply(list).map(str).nunique() == 1
 
 
+def test_a_run_keeps_its_weights_and_no_state_of_the_optimiser(study):
+    for run in runs_of(read_spec("smoke"), study):
+        assert (run.checkpoint / "model.safetensors").is_file()
+        assert not list(run.folder.rglob("training_state"))
+
+
 @pytest.mark.long
 def test_the_warm_start_study_end_to_end(tmp_path):
     """Every phase as a user starts it: the estimate, the pretraining, two multiples of the steps, the sweep, the report."""

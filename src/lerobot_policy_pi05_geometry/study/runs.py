@@ -23,6 +23,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from lerobot.utils.constants import TRAINING_STATE_DIR
+
 from .arms import Arm, find_arm
 
 ReportProgress = Callable[[str, int, int], None]  # (stage, work done, total work)
@@ -122,6 +124,8 @@ class Run(ABC):
         output = self.folder / "training"
         shutil.rmtree(output, ignore_errors=True)  # of an interrupted training
         self.train(output)
+        # LeRobot's optimiser state: twice the size of the weights, and a run is never resumed from it.
+        shutil.rmtree(output / "checkpoints" / "last" / TRAINING_STATE_DIR)
         output.rename(self.folder / "trained")
 
     def to_json(self) -> str:
