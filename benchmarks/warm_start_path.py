@@ -111,6 +111,8 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="of training and of the chunk")
     parser.add_argument("--output", type=Path, help="write the numbers to this JSON file")
     args = parser.parse_args()
+    if args.folder is not None:
+        args.folder.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix="warm_start_", dir=args.folder))
     try:
         paligemma, expert, pixels = SIZES[args.size]

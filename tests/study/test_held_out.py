@@ -183,6 +183,11 @@ def test_an_own_grid_is_converted_to_and_not_given_twice(root, tmp_path):
     assert other.folder != run.folder != replace(run, pi05=None).folder
 
 
+def test_a_study_that_keeps_no_checkpoint_is_refused(root, tmp_path):
+    with pytest.raises(ValueError, match="leave --save_checkpoint out"):
+        held_out_runs(tmp_path, root, "local/mine", ["rgb"], [0], {"save_checkpoint": "false"}, 2, 0.4, 3)
+
+
 def test_an_arm_that_a_conversion_undoes_is_refused(root, tmp_path):
     for arm in ("prefix", "gate-closed", "parallel"):
         with pytest.raises(ValueError, match=f"'{arm}' is for policies trained from scratch"):

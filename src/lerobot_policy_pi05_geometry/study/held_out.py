@@ -234,6 +234,8 @@ def held_out_runs(
             raise ValueError(f"--{name} must be at least {least}, got {count}.")
     if options.get("dataset.streaming", "false").lower() != "false":
         raise ValueError("A study cannot stream its dataset, whose episodes it divides; leave --dataset.streaming out.")
+    if options.get("save_checkpoint", "true").lower() != "true":
+        raise ValueError("A study evaluates the checkpoints that it trains; leave --save_checkpoint out.")
     if not 0 < held_out < 1:
         raise ValueError(f"The share of held-out episodes must be between 0 and 1, got {held_out}.")
     for name in arms:
